@@ -26,6 +26,7 @@ HOT = (
     "motion",
     "object_timers",
     "own_calibration",
+    "prediction",
     "range_errors",
     "recovery",
     "relocalization",

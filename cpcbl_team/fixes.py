@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 from msgspec.structs import replace
 
+from cpcbl_team.common_errors import CommonErrors
 from cpcbl_team.config import SensorSettings
 from cpcbl_team.estimate import Estimate
 from cpcbl_team.fusion import Observation
@@ -33,6 +34,7 @@ def fix_for(
     sighting: Sighting,
     sensor: SensorSettings,
     earlier: Fix | None = None,
+    common: CommonErrors | None = None,
 ) -> Fix | None:
     """The fix of the robot that `observer` saw; None if range or bearing is missing or unusable.
 
@@ -42,7 +44,8 @@ def fix_for(
     which J does not know: its variance along the line of sight is added to the observer's part. A
     heading of the teammate is the observer's plus the one in its frame, and so are their variances.
     The sigma is a share of the range to an `earlier` fix: that one errs apart from this reading.
-    The position is not that of the reading itself, but see `unbiased_range_m`.
+    The position is not that of the reading itself, but see `unbiased_range_m`. The constant errors
+    of the observer's camera (`common`) are part of the observer's error.
     """
     range_m, bearing = sighting.range_m, sighting.bearing_rad
     if range_m is None or bearing is None or sighting_fault(sighting):
@@ -60,6 +63,10 @@ def fix_for(
     arc, dx, dy = arc_variance(covariance.hh), x - pose.x, y - pose.y
     observer_part = covariance.transformed(jacobian).position()
     observer_part += Covariance2(arc * dx * dx, arc * dx * dy, arc * dy * dy)
+    turned = covariance.hh
+    if common is not None:
+        observer_part += common.of_point(dx, dy, bearing)
+        turned += common.of_direction
     fix = Fix(sighting.id, observer, stamp_ns, x, y, rotated, observer_part)
     heading, heading_sigma = sighting.heading_rad, sighting.heading_sigma_rad
     if heading is None or heading_sigma is None:
@@ -68,7 +75,7 @@ def fix_for(
         fix,
         heading_rad=wrap_angle(pose.heading + heading),
         heading_sensor_variance=heading_sigma * heading_sigma,
-        heading_observer_variance=covariance.hh,
+        heading_observer_variance=turned,
     )
 
 

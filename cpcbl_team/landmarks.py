@@ -86,13 +86,17 @@ class Landmarks:
     """The plain landmarks of a map, as one robot's sensor and rules use them."""
 
     def __init__(
-        self, field: Field, settings: LocalizationSettings, gates: tuple[float, float]
+        self,
+        field: Field,
+        settings: LocalizationSettings,
+        gates: tuple[float, float],
+        has_common_errors: bool = False,
     ) -> None:
         """`gates`: chi-square bounds of one and of two constraints. No landmark is plain where the
-        rules ask for more than `update` does."""
+        rules, or errors that all sightings have in common, ask for more than `update` does."""
         rules, s = settings.localizer, settings.sensor
         plain = rules.variant != "weighted" and not (
-            rules.paper_uncertainty or rules.learns or s.correlation_s > 0.0
+            rules.paper_uncertainty or rules.learns or s.correlation_s > 0.0 or has_common_errors
         )
         self._marks: dict[str, Mark] = {}
         if plain:

@@ -7,11 +7,13 @@ import math
 from collections.abc import Iterable
 from typing import Final
 
-from cpcbl_team.config import Field, LocalizationSettings
+from cpcbl_team.camera_filter import CameraFilter, considers_camera
+from cpcbl_team.common_errors import CommonErrors
+from cpcbl_team.config import CameraSettings, Field, LocalizationSettings
 from cpcbl_team.estimate import HEADING, POSE, POSITION, Estimate, Scope
 from cpcbl_team.fixes import PoseObservation, from_fix, from_position_sensor
 from cpcbl_team.fusion import chi_square_bounds, mark_shared
-from cpcbl_team.geometry import new, step
+from cpcbl_team.geometry import new
 from cpcbl_team.inputs import (
     Belief,
     BeliefShared,
@@ -34,9 +36,9 @@ from cpcbl_team.measurements import (
     measurement_of,
 )
 from cpcbl_team.mended_inputs import with_mended_inputs
-from cpcbl_team.motion import NO_VARIANCE, bridge, inflate_by_gap, is_gap, part_of_piece
 from cpcbl_team.object_timers import ObjectTimers, has_passed
 from cpcbl_team.own_calibration import OwnCalibration
+from cpcbl_team.prediction import Prediction
 from cpcbl_team.recovery import (
     Recovery,
     evidence_from_observation,
@@ -46,15 +48,14 @@ from cpcbl_team.recovery import (
     with_measurements,
     with_snapshot,
 )
-from cpcbl_team.sensors import sighting_fault, time_at_min_speed_s
+from cpcbl_team.sensors import sighting_fault
 from cpcbl_team.state import (
     LandmarkSnapshot,
     State,
     state_at_start,
     updates_with_frame,
+    with_belief,
     with_correction,
-    with_motion,
-    with_odometry,
     with_recovery,
     with_teammates,
     with_uses,
@@ -71,24 +72,31 @@ class Localizer:
     """The localizer of one robot on one field."""
 
     def __init__(
-        self, settings: LocalizationSettings, field: Field, team: frozenset[str] | None = None
+        self,
+        settings: LocalizationSettings,
+        field: Field,
+        team: frozenset[str] | None = None,
+        camera: CameraSettings | None = None,
     ) -> None:
-        """`team`: its robots; who else sends something is a guest (None: there are no guests)."""
+        """`team`: its robots; who else sends something is a guest (None: there are no guests).
+        `camera`: of a robot whose sightings are its camera's, without the errors that all of them
+        have in common."""
         self.settings, self.field, rules = settings, field, settings.localizer
         gates = chi_square_bounds(rules.gate_probability)
         self._rules, self._gates = rules, gates
         self._minimum_interval_ns = rules.minimum_interval_s * 1e9
-        self._odometry = settings.odometry
-        self._moves = settings.odometry.moves
-        self._odometry_timeout_ns = int(settings.odometry.timeout_s * 1e9)
-        self._has_dead_zone = settings.odometry.least_speed_m_s > 0.0
         self._widens = rules.variant != "weighted" and not rules.paper_uncertainty
         self._window = rules.lost_window
         self._belief_age_ns = int(settings.collaboration.max_age_s * 1e9)
         self._timers = ObjectTimers(settings)
         self._variant = variant_of(settings, field)
-        self._landmarks = Landmarks(field, settings, gates)
+        self._camera: CameraFilter | None = None
+        if camera is not None and considers_camera(settings, camera):
+            self._camera = CameraFilter(settings, camera)
+        self._landmarks = Landmarks(field, settings, gates, self._camera is not None)
         self._calibration = OwnCalibration(settings, field, self._landmarks)
+        parts = self._variant, self._calibration, self._camera
+        self._prediction = Prediction(settings, *parts)
         self.recovery = Recovery(settings, field, self._landmarks, self._variant.reduce)
         self.screen = TeammateScreen(settings, gates, self._variant.is_probabilistic, team)
 
@@ -102,73 +110,25 @@ class Localizer:
         state, scope, landmarks, others = self.measure(state, frame)  # 2. measurements
         if scope is None:  # nothing may be updated
             return self.recovery.check(state)
-        gated = self.constrain(state.estimate, others, scope) if others else _NO_OBJECTS  # 3.
+        common = state.common_errors
+        gated = self.constrain(state.estimate, others, scope, common) if others else _NO_OBJECTS
         if self.screen.has_recent_reports(state, now):  # beyond the paper: trust
             state, gated = self.screen.screen_frame(state, landmarks, gated)
-        estimate = self.correct(state.estimate, landmarks, gated, scope)  # 4. combine, 5. merge
+        if self._camera is None:
+            estimate = self.correct(state.estimate, landmarks, gated, scope)
+        else:
+            state, estimate = self._camera.correct(state, gated.accepted)
         return self.recovery.check(self._with_frame(state, estimate, landmarks, gated, scope))
 
     # Step 1 -----------------------------------------------------------------------------------
 
     def add_odometry(self, state: State, odometry: Odometry) -> State:
         """Takes the next piece of odometry; predictions for later times will use it."""
-        from_ns, until_ns = odometry.from_ns, odometry.stamp_ns
-        if until_ns <= from_ns:
-            return state.counted("impossible_duration")
-        before = state.odometry
-        if before is not None and from_ns > state.odometry_until_ns:
-            if is_gap(from_ns - state.odometry_until_ns, before, odometry):
-                state = state.counted("odometry_gap")
-            else:
-                state = with_odometry(state, before, from_ns)
-        if from_ns > state.stamp_ns:
-            state = self.predict(state, from_ns, odometry)
-        if before is not None and before.stamp_ns > state.stamp_ns:
-            state = state.counted("odometry_overlap")
-        return with_odometry(state, odometry, max(state.odometry_until_ns, until_ns))
+        return self._prediction.add_odometry(state, odometry)
 
-    def predict(self, state: State, until_ns: int, following: Odometry | None = None) -> State:
-        """Step 1: the state at `until_ns`, moved along the known odometry (J C J^T, section 4).
-
-        Where odometry was lost the robot drives on as before; `following` is the piece that begins
-        at `until_ns`, if one does.
-        """
-        stamp_ns, estimate = state.stamp_ns, state.estimate
-        if until_ns <= stamp_ns:
-            return state
-        odometry_from_robot, piece = state.odometry_from_robot, state.odometry
-        if piece is not None and piece.stamp_ns > stamp_ns:
-            distance, turn, seconds = part_of_piece(piece, stamp_ns, until_ns)
-            crawl_s = 0.0
-            if self._has_dead_zone:
-                crawl_s = time_at_min_speed_s(distance, seconds, self._odometry)
-            extra, own = NO_VARIANCE, self._calibration
-            if own.is_known(state):
-                state, distance, turn = own.corrected_motion(state, distance, turn)
-                extra = own.extra_variance(state, distance, turn, crawl_s)
-            if distance != 0.0 or turn != 0.0:
-                odometry_from_robot = step(odometry_from_robot, distance, turn)
-                estimate = self._variant.move(estimate, distance, turn, crawl_s, extra)
-        state = with_motion(state, until_ns, estimate, odometry_from_robot)
-        if self._moves and until_ns > state.odometry_until_ns:
-            return self._across_gap(state, stamp_ns, following)
-        return state
-
-    def _across_gap(self, state: State, from_ns: int, following: Odometry | None) -> State:
-        """The state after the part of a gap in the odometry since `from_ns`."""
-        until_ns, estimate, place, before, begin_ns, _, _ = state
-        gap_ns = until_ns - begin_ns
-        from_s = max(from_ns - begin_ns, 0) * 1e-9
-        distance, turn, extra = bridge(before, following, from_s, gap_ns * 1e-9, self._odometry)
-        if self._calibration.is_known(state):
-            state, distance, turn = self._calibration.corrected_motion(state, distance, turn)
-        if distance != 0.0 or turn != 0.0 or extra != NO_VARIANCE:
-            place = step(place, distance, turn)
-            estimate = self._variant.move(estimate, distance, turn, 0.0, extra)
-        silent_ns = min(gap_ns - self._odometry_timeout_ns, until_ns - from_ns)
-        if silent_ns > 0:
-            estimate = inflate_by_gap(estimate, silent_ns, before, self._odometry.gap_speed_m_s)
-        return with_motion(state, until_ns, estimate, place)
+    def predict(self, state: State, until_ns: int) -> State:
+        """Step 1: the state at `until_ns`, moved along the known odometry."""
+        return self._prediction.predict(state, until_ns)
 
     # Step 2 -----------------------------------------------------------------------------------
 
@@ -202,7 +162,10 @@ class Localizer:
             snapshot = new(LandmarkSnapshot, fields)
             state = with_recovery(state, with_snapshot(recovery, snapshot))
         if measured or faults:
-            state = with_recovery(state, with_measurements(state, measured)).counted(*faults)
+            evidence, camera = measured, self._camera
+            if camera is not None:
+                evidence = [camera.as_evidence(state, m) for m in measured]
+            state = with_recovery(state, with_measurements(state, evidence)).counted(*faults)
         return state, scope, landmarks, usable
 
     def _update_order(self, state: State) -> UpdateOrder:
@@ -236,6 +199,8 @@ class Localizer:
             if fault:
                 faults.append(fault)
                 continue
+            if self._camera is not None:
+                sighting = self._camera.corrected(state, sighting)
             m = measurement_of(sighting, now_ns, pose, self.field, beliefs, self.settings)
             if m is not None:
                 m = m.corrected(bias, adaptation.ranges) if is_wrong else m
@@ -245,7 +210,11 @@ class Localizer:
     # Steps 3 to 5 -----------------------------------------------------------------------------
 
     def constrain(
-        self, prior: Estimate, measurements: list[Measurement], scope: Scope
+        self,
+        prior: Estimate,
+        measurements: list[Measurement],
+        scope: Scope,
+        common: CommonErrors | None = None,
     ) -> GatedObjects:
         """Step 3: the constraints of each object, accepted or rejected by the chi-square bound of
         their innovation at the prior."""
@@ -255,7 +224,7 @@ class Localizer:
             if self._widens and not m.is_teammate:
                 constraints = curved(prior, m, constraints)
             if constraints:
-                found = gated_object(prior, m, constraints)
+                found = gated_object(prior, m, constraints, common)
                 is_accepted = found.nis <= self._gates[len(constraints) - 1]
                 (gated.accepted if is_accepted else gated.rejected).append(found)
         return gated
@@ -331,7 +300,10 @@ class Localizer:
         if nis > self._gates[1]:
             return self.recovery.check(self._with_update(state, prior, None, {}, 1))
         by_teammate = observation.observer is not None
-        estimate = self._variant.correct_position(prior, position, by_teammate)
+        if self._camera is not None:
+            state, estimate = self._camera.observed(state, prior, position, by_teammate)
+        else:
+            estimate = self._variant.correct_position(prior, position, by_teammate)
         return self._observe_heading(state, estimate, observation)
 
     def _observe_heading(
@@ -342,7 +314,10 @@ class Localizer:
         heading = observation.of_heading(estimate.pose)
         if heading is not None:
             if heading.normalized_innovation_squared(estimate.covariance) <= self._gates[0]:
-                estimate = self._variant.correct_heading(estimate, heading)
+                if self._camera is not None:
+                    state, estimate = self._camera.observed(state, estimate, heading, True)
+                else:
+                    estimate = self._variant.correct_heading(estimate, heading)
             else:
                 # The position is kept, for a marker's angle is measured wrong more often than its
                 # place. Still the fix counts as rejected: so a robot whose own heading is wrong
@@ -369,15 +344,7 @@ class Localizer:
         """Passive collaboration: keeps a teammate's belief, for when the teammate is visible. The
         state's time stays, for to divide a motion would change the last bits of later poses."""
         now_ns = belief.stamp_ns - BELIEF_VALID_BEFORE_NS
-        oldest_ns = now_ns - self._belief_age_ns
-        beliefs = {
-            name: fresh
-            for name, all_of_it in state.memory.teammates.beliefs.items()
-            if (fresh := tuple(b for b in all_of_it if b.stamp_ns >= oldest_ns))
-        }
-        beliefs[belief.robot] = (*beliefs.get(belief.robot, ()), belief)
-        memory = state.memory.teammates._replace(beliefs=beliefs, last_report_ns=now_ns)
-        return with_teammates(state, memory)
+        return with_belief(state, belief, now_ns, now_ns - self._belief_age_ns)
 
     def mark_shared(self, state: State, event: BeliefShared) -> State:
         """This robot's belief goes to a teammate: its information may come back."""
@@ -387,13 +354,15 @@ class Localizer:
     def forget_wrong_inputs(self, state: State, event: InputsMended) -> State:
         """What the robot changed in its settings because of wrong inputs is as configured again."""
         state = self._calibration.without_adaptation(self.predict(state, event.stamp_ns))
-        return with_mended_inputs(state, event)
+        state = with_mended_inputs(state, event)
+        return state if self._camera is None else self._camera.started(state)
 
     # The start --------------------------------------------------------------------------------
 
     def start(self, stamp_ns: int) -> State:
         """The state at the start: at the configured pose, or lost somewhere on the field."""
-        return state_at_start(stamp_ns, self.settings.start, self.field)
+        state = state_at_start(stamp_ns, self.settings.start, self.field)
+        return state if self._camera is None else self._camera.started(state)
 
 
 def _source(m: Measurement) -> str:

@@ -9,6 +9,8 @@ from typing import NamedTuple
 import msgspec
 
 from cpcbl_team import config
+from cpcbl_team.camera_errors import bearing_sensitivity, range_sensitivity
+from cpcbl_team.common_errors import CommonErrors, Pair
 from cpcbl_team.constraints import (
     CURVED_SHARE,
     Constraint,
@@ -135,6 +137,8 @@ class GatedObject(NamedTuple):
     nis: float
     observation: Observation | None = None
     """Of a teammate: the constraints as one observation of the prior."""
+    sensitivities: tuple[Pair, ...] = ()
+    """How the residuals follow the common errors of the camera, where they are considered."""
 
 
 class GatedObjects(NamedTuple):
@@ -266,22 +270,48 @@ def combine(evidence: Information, accepted: Iterable[GatedObject]) -> Informati
     )
 
 
-def gated_object(prior: Estimate, m: Measurement, cs: list[Constraint]) -> GatedObject:
+def gated_object(
+    prior: Estimate, m: Measurement, cs: list[Constraint], common: CommonErrors | None = None
+) -> GatedObject:
     """One object with the normalized innovation squared of its constraints."""
     covariance = prior.covariance
+    added = _EXACT
+    sensitivities: tuple[Pair, ...] = ()
+    if common is not None:
+        sensitivities = sensitivities_of(m, cs, common)
+        added = common.innovation(tuple(c.row for c in cs), sensitivities)
     if m.is_teammate:
         observation = observation_of(prior, m, cs)
+        if common is not None:
+            observation = observation._replace(dependent=observation.dependent + added)
         nis = observation.normalized_innovation_squared(covariance)
-        return GatedObject(m, cs, nis, observation)
+        return GatedObject(m, cs, nis, observation, sensitivities)
     first, last = cs[0], cs[-1]
     rxx, ryy = first.sigma * first.sigma, last.sigma * last.sigma
     noise = rxx + SMALLEST_VARIANCE, 0.0, ryy + SMALLEST_VARIANCE
+    if common is not None:
+        noise = noise[0] + added.xx, added.xy, noise[2] + added.yy
     if first is last:
         nis = chi_square(covariance, noise, (first.row,), (first.residual,))
     else:
         rows, residuals = (first.row, last.row), (first.residual, last.residual)
         nis = chi_square(covariance, noise, rows, residuals)
-    return GatedObject(m, cs, nis)
+    return GatedObject(m, cs, nis, None, sensitivities)
+
+
+def sensitivities_of(
+    m: Measurement, cs: list[Constraint], common: CommonErrors
+) -> tuple[Pair, ...]:
+    """How the residuals of constraints follow the errors of the camera."""
+    off_axis = 0.0 if m.bearing is None else m.bearing - common.axis_rad
+    pairs = []
+    for c in cs:
+        if c.is_bearing:  # its residual falls when the bearing grows
+            yaw, focal = bearing_sensitivity(off_axis)
+            pairs.append((-c.row[2] * yaw, -c.row[2] * focal))
+        else:
+            pairs.append(range_sensitivity(m.range_m or 0.0, off_axis))
+    return tuple(pairs)
 
 
 def observation_of(prior: Estimate, m: Measurement, cs: list[Constraint]) -> Observation:

@@ -107,6 +107,8 @@ class OwnCalibration:
         if not self._is_checked:
             return state
         memory, now_ns = state.memory.calibration, state.stamp_ns
+        if memory.common is not None and not memory.common.is_precise:
+            return state  # corrections of the pose tell of the camera
         check = memory.check
         begin, ahead = check.begin, check.ahead
         if begin is None or ahead is None or now_ns - begin.stamp_ns >= BLOCK_NS:
@@ -121,7 +123,7 @@ class OwnCalibration:
         """The state without what the robot noticed of its settings and of its map so far."""
         memory, check = state.memory.calibration, ModelCheck(accepted=state.updates.accepted)
         known = CalibrationMemory(memory.learned, memory.references, memory.total_turn_rad, check)
-        return _with_calibration(state, known)
+        return _with_calibration(state, known._replace(common=memory.common))
 
     def _with_ranges(self, state: State) -> State:
         """The state that has compared distances between landmarks with the map, once a block."""
@@ -214,8 +216,8 @@ class OwnCalibration:
 
     def _with_check(self, state: State, check: ModelCheck, present: Adaptation) -> State:
         memory = state.memory.calibration
-        learned, references, total_turn_rad, _, _, rejections, ranges = memory
-        parts = learned, references, total_turn_rad, check, present, rejections, ranges
+        learned, references, total_turn_rad, _, _, rejections, ranges, common = memory
+        parts = learned, references, total_turn_rad, check, present, rejections, ranges, common
         return _with_calibration(state, new(CalibrationMemory, parts))
 
 

@@ -370,6 +370,7 @@ class Recovery:
     def _found(self, state: State, estimate: Estimate, recovery: RecoveryMemory) -> State:
         """The state of a robot that is found again: here everything begins anew."""
         _, teammates, calibration, _ = memory = state.memory.counted("found_again")
+        common = calibration.common
         memory = memory._replace(
             recovery=with_jump(state, recovery, estimate.pose)._replace(
                 lost="", kidnapped_ns=-1, suspected_ns=-1
@@ -379,6 +380,7 @@ class Recovery:
                 references=None,
                 check=calibration.check.restarted(state.updates.accepted),
                 rejections=MapRejections(stamp_ns=state.stamp_ns, counted=state.updates.accepted),
+                common=None if common is None else common.uncorrelated(),
             ),
         )
         updates = state.updates._replace(innovations=1)

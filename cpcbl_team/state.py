@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
+from cpcbl_team.common_errors import CommonErrors
 from cpcbl_team.config import Field, Start
 from cpcbl_team.estimate import HEADING, POSE, POSITION, Covariance3, Estimate, Scope
 from cpcbl_team.geometry import Pose2, new, wrap_angle
@@ -160,6 +161,9 @@ class CalibrationMemory(NamedTuple):
     adaptation: Adaptation = AS_CONFIGURED
     rejections: MapRejections = MapRejections()
     ranges: RangeEvidence = RangeEvidence()
+    common: CommonErrors | None = None
+    """What is known of the constant errors of the camera; None without a camera whose errors the
+    filter considers."""
 
     @property
     def corrected(self) -> SelfCalibration:
@@ -205,6 +209,11 @@ class State(NamedTuple):
     def reported(self) -> Estimate:
         """The estimate as it is told to others: as uncertain as the settings are, too."""
         return with_doubts(self.estimate, self.memory.calibration.check)
+
+    @property
+    def common_errors(self) -> CommonErrors | None:
+        """What the robot knows of the constant errors of its camera."""
+        return self.memory.calibration.common
 
     @property
     def lost(self) -> str:
@@ -266,6 +275,18 @@ def with_beliefs(state: State, beliefs_of: State) -> State:
     return with_teammates(state, new(TeammateMemory, (beliefs, senders, last_ns)))
 
 
+def with_belief(state: State, belief: Belief, now_ns: int, oldest_ns: int) -> State:
+    """The state with a teammate's belief that came now, without those that are older than this."""
+    beliefs = {
+        name: fresh
+        for name, all_of_it in state.memory.teammates.beliefs.items()
+        if (fresh := tuple(b for b in all_of_it if b.stamp_ns >= oldest_ns))
+    }
+    beliefs[belief.robot] = (*beliefs.get(belief.robot, ()), belief)
+    memory = state.memory.teammates._replace(beliefs=beliefs, last_report_ns=now_ns)
+    return with_teammates(state, memory)
+
+
 def with_teammates(state: State, teammates: TeammateMemory) -> State:
     """The state with this memory of teammates."""
     recovery, _, calibration, events = state.memory
@@ -281,6 +302,13 @@ def with_senders(teammates: TeammateMemory, senders: Mapping[str, SenderRecord])
 def with_recovery(state: State, recovery: RecoveryMemory) -> State:
     """The state with this memory of the recovery."""
     _, teammates, calibration, events = state.memory
+    return with_memory(state, new(Memory, (recovery, teammates, calibration, events)))
+
+
+def with_common_errors(state: State, common: CommonErrors) -> State:
+    """The state that knows this of the constant errors of the camera."""
+    recovery, teammates, calibration, events = state.memory
+    calibration = new(CalibrationMemory, (*calibration[:7], common))
     return with_memory(state, new(Memory, (recovery, teammates, calibration, events)))
 
 

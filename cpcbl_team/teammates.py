@@ -11,15 +11,17 @@ from msgspec.structs import replace
 
 from cpcbl_team import trust
 from cpcbl_team.config import LocalizationSettings
-from cpcbl_team.estimate import Information
+from cpcbl_team.estimate import Covariance3, Information
 from cpcbl_team.fixes import PoseObservation
 from cpcbl_team.fusion import Observation
 from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.inputs import Belief, Input, Position, Sightings
 from cpcbl_team.landmarks import LandmarkUpdate
+from cpcbl_team.mean_offsets import HEADING_VARIANCE
 from cpcbl_team.measurements import (
     GatedObject,
     GatedObjects,
+    Measurement,
     combine,
     nearest_belief,
     observation_of,
@@ -30,6 +32,8 @@ from cpcbl_team.sender_records import NEVER_NS, OffsetEvidence, ReportedPosition
 from cpcbl_team.state import State, with_memory, with_senders, with_teammates
 
 LEAST_CONFIRMED = 20  # reports of a guest beside which others agreed, until it counts as the others
+INDEPENDENT_FRAMES = 0.1  # of a camera: the next frame has nearly the same errors of tilt and edges
+FARTHEST_OFFSET_M = 1.0  # of what a frame tells of the position, where it tells little
 MOST_SENDERS = 512  # of which records are kept
 
 
@@ -67,17 +71,16 @@ class TeammateScreen:
         accepted, rejected = accepted + len(landmarks.used), rejected + len(landmarks.rejected)
         if (accepted or rejected) and not is_lost:
             sums = combine(Information.of(landmarks.evidence.sums()), gated.accepted)
-            state = self._with_own_sensors(state, accepted, rejected, sums)
+            own = _own_offset(state, sums, gated.accepted)
+            state = self._with_own_sensors(state, accepted, rejected, own)
         distrusted = set()
-        for m, constraints, nis, observation in (*gated.accepted, *gated.rejected):
+        for m, constraints, nis, observation, _ in (*gated.accepted, *gated.rejected):
             if m.is_teammate:
                 is_fresh = _has_fresh(state.memory.teammates.beliefs[m.source], now)
                 of_two = 2.0 * nis / len(constraints) if is_fresh and not is_lost else None
-                evidence = (
-                    self._evidence(state, observation)
-                    if of_two is not None and observation
-                    else None
-                )
+                evidence = None
+                if of_two is not None and observation:
+                    evidence = _with_camera(state, m, self._evidence(state, observation))
                 report = TeammateReport(
                     now, of_two, evidence=evidence, is_guest=self._is_guest(m.source)
                 )
@@ -147,7 +150,8 @@ class TeammateScreen:
             if self.has_recent_reports(state, now) and not is_lost:
                 is_accepted = nis <= self._gates[1]
                 sums = position.information(position.noise(0.0))
-                state = self._with_own_sensors(state, is_accepted, not is_accepted, sums)
+                own = OffsetEvidence(sums, heading_variance=state.estimate.covariance.hh)
+                state = self._with_own_sensors(state, is_accepted, not is_accepted, own)
             return state, True
         heading, of_heading = observation.of_heading(state.estimate.pose), None
         if heading is not None:  # three degrees of freedom, scaled to two
@@ -186,11 +190,10 @@ class TeammateScreen:
         return _has_fresh(old, now_ns) is not _has_fresh(new, now_ns)
 
     def _with_own_sensors(
-        self, state: State, accepted: int, rejected: int, sums: Information
+        self, state: State, accepted: int, rejected: int, evidence: OffsetEvidence
     ) -> State:
         """The state with how far the robot's own sensors agree with the estimate."""
         memory = state.memory.teammates
-        evidence = OffsetEvidence(sums, heading_variance=state.estimate.covariance.hh)
         result = state.stamp_ns, accepted, rejected, self._rules.limit, evidence
         senders = trust.with_own_sensor_result(memory.senders, *result)
         return with_teammates(state, with_senders(memory, senders))
@@ -218,6 +221,56 @@ class TeammateScreen:
             state = state._replace(estimate=estimate)
         teammates = with_senders(memory.teammates, _bounded(decision.senders))
         return with_teammates(state, teammates), decision.trusted
+
+
+def _own_offset(state: State, sums: Information, accepted: Iterable[GatedObject]) -> OffsetEvidence:
+    """What the robot's own sensors say of the offset of the estimate in one frame."""
+    common, variance = state.common_errors, state.estimate.covariance.hh
+    if common is None:
+        return OffsetEvidence(sums, heading_variance=variance)
+    of_yaw = of_focal = Information.none()
+    for found in accepted:
+        if not found.measurement.is_teammate:
+            for c, (yaw, focal) in zip(found.constraints, found.sensitivities, strict=True):
+                of_yaw = of_yaw.add(c.row, yaw, c.sigma * c.sigma)
+                of_focal = of_focal.add(c.row, focal, c.sigma * c.sigma)
+    place, turn = 1.0 / FARTHEST_OFFSET_M**2, 1.0 / (variance + HEADING_VARIANCE)
+    prior = Covariance3(place, 0.0, place, 0.0, 0.0, turn)
+    inverse = sums.matrix.plus(prior).inverse()
+    (ax, ay, _), (bx, by, _) = (inverse.times(i.vector) for i in (of_yaw, of_focal))
+    yy, yf, ff = common.covariance
+    dependent = Covariance2(
+        ax * ax * yy + 2.0 * ax * bx * yf + bx * bx * ff,
+        ax * ay * yy + (ax * by + ay * bx) * yf + bx * by * ff,
+        ay * ay * yy + 2.0 * ay * by * yf + by * by * ff,
+    )
+    position = _without_heading(sums, turn)
+    alone = tuple(INDEPENDENT_FRAMES * v for v in position.vector)
+    position = Information(position.matrix.scaled(INDEPENDENT_FRAMES), (alone[0], alone[1], 0.0))
+    return OffsetEvidence(position, dependent, variance)
+
+
+def _with_camera(state: State, m: Measurement, evidence: OffsetEvidence) -> OffsetEvidence:
+    """What a sighting of a teammate says of the offset, with the constant errors of the camera
+    in it."""
+    common = state.common_errors
+    if common is None:
+        return evidence
+    (x, y, covariance), (yy, _, ff), pose = m.position, common.covariance, state.estimate.pose
+    squared = (x - pose.x) ** 2 + (y - pose.y) ** 2
+    variance = 0.5 * (covariance.xx + covariance.yy + squared * (yy + ff))
+    turn = 1.0 / (evidence.heading_variance + HEADING_VARIANCE)
+    sums = _without_heading(Information.of(evidence.evidence), turn)
+    return evidence._replace(evidence=sums, dependent=Covariance2(variance, 0.0, variance))
+
+
+def _without_heading(sums: Information, prior: float) -> Information:
+    """What a frame says of the position alone (the Schur complement). `prior`: the information
+    (1/rad^2) about the heading, whose error is not the same in all frames."""
+    (xx, xy, yy, xh, yh, hh), (x, y, h) = sums
+    k = 1.0 / (hh + prior)
+    matrix = Covariance3(xx - k * xh * xh, xy - k * xh * yh, yy - k * yh * yh, 0.0, 0.0, 0.0)
+    return Information(matrix, (x - k * xh * h, y - k * yh * h, 0.0))
 
 
 def _bounded(senders: SenderRecords) -> SenderRecords:

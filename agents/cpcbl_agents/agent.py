@@ -6,6 +6,7 @@ the same object runs live, in one process with others, and in replay.
 
 from typing import NamedTuple
 
+from cpcbl_team.common_errors import CommonErrors
 from cpcbl_team.estimate import Estimate
 from cpcbl_team.inputs import Belief, BeliefShared, Fix, InputsMended, Sightings
 from cpcbl_transport.messages import Message
@@ -33,6 +34,7 @@ class FrameEstimate(NamedTuple):
     estimate: Estimate
     lost: str
     sensor_factor: float = 1.0  # the sensor's variances are so many times those of the settings
+    common: CommonErrors | None = None  # what may be left of the camera's constant errors
 
 
 class Presence(NamedTuple):

@@ -239,7 +239,7 @@ class CollaborationAgent:
             if s.id not in self._teammates and not self.guests.notice(s.id, stamp_ns):
                 continue
             earlier = self._latest_fixes.get(s.id)
-            fix = fix_for(self._robot, stamp_ns, seen.estimate, s, sensor, earlier)
+            fix = fix_for(self._robot, stamp_ns, seen.estimate, s, sensor, earlier, seen.common)
             if fix is None:
                 continue
             fix = with_sensor_factor(fix, seen.sensor_factor)

@@ -4,7 +4,8 @@ from collections import Counter, deque
 from collections.abc import Sequence
 
 from cpcbl_agents.agent import AgentMessage, FrameEstimate, PoseEstimate, Presence, Tick
-from cpcbl_team.config import Field, LocalizationSettings
+from cpcbl_team.camera_errors import without_errors
+from cpcbl_team.config import CameraSettings, Field, LocalizationSettings
 from cpcbl_team.inputs import (
     Belief,
     BeliefShared,
@@ -30,9 +31,15 @@ class FilterAgent:
     """Runs one localizer on its timeline. It reports its estimate at 10 Hz and for each frame."""
 
     def __init__(
-        self, settings: LocalizationSettings, field: Field, teammates: frozenset[str], start_ns: int
+        self,
+        settings: LocalizationSettings,
+        field: Field,
+        teammates: frozenset[str],
+        start_ns: int,
+        camera: CameraSettings | None = None,
     ) -> None:
-        localizer = Localizer(settings, field, teammates)
+        """`camera`: of a robot whose sightings are its camera's."""
+        localizer = Localizer(settings, field, teammates, camera)
         self.timeline = Timeline(localizer, localizer.start(start_ns))
         self.counts: Counter[str] = Counter()
         self.refused: Counter[tuple[str, str]] = Counter()
@@ -132,5 +139,11 @@ class FilterAgent:
             adaptation = calibration.adaptation
             factor, scale = adaptation.sensor_factor, adaptation.ranges.scale
             frame = recalibrated(frame, calibration.bearing_bias_rad, scale)
-            ready.append(FrameEstimate(frame, state.reported, state.lost, factor))
+            common = state.common_errors
+            if common is not None:
+                corrected = (
+                    without_errors(s, common.errors, common.axis_rad) for s in frame.sightings
+                )
+                frame = Sightings(frame.stamp_ns, tuple(corrected))
+            ready.append(FrameEstimate(frame, state.reported, state.lost, factor, common))
         return ready

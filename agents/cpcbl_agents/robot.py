@@ -9,6 +9,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
+from msgspec.structs import replace
+
 from cpcbl_agents.agent import AgentMessage, BusEvent, FrameSubscribers, HelpSent, Presence, Tick
 from cpcbl_agents.clocks import ClockMonitor
 from cpcbl_agents.collaboration import CollaborationAgent
@@ -17,6 +19,7 @@ from cpcbl_agents.guests import GuestRegistry
 from cpcbl_agents.sensing import SensingAgent
 from cpcbl_agents.sources import OwnCamera, Source
 from cpcbl_agents.waypoint_follower import WaypointFollower
+from cpcbl_team.camera_filter import considers_camera
 from cpcbl_team.config import Team
 from cpcbl_team.estimate import Estimate
 from cpcbl_team.inputs import BeliefShared, InputsMended, SightingFault
@@ -48,7 +51,8 @@ class Robot:
     ) -> None:
         settings, teammates = team.robots[name], frozenset(team.robots) - {name}
         self.name, self.sensing, self._shared_ns = name, sensing, start_ns
-        self.filter = FilterAgent(settings, team.map, teammates, start_ns)
+        camera = settings.camera if settings.sensing == "camera" else None
+        self.filter = FilterAgent(settings, team.map, teammates, start_ns, camera)
         self._is_weighted = settings.localizer.variant == "weighted"  # it has no covariance
         self._sightings_input = "frame" if settings.sensing == "camera" else "sightings"
         match = team.messages_per_s(name), restarted, team.match.duration_s
@@ -217,5 +221,16 @@ def build_sensing(
         from cpcbl_agents.vision.camera_correction import CameraCorrection
         from cpcbl_agents.vision.detector import CameraDetector
 
-        detector, correction = CameraDetector(name, team), CameraCorrection(name, team)
+        detector = CameraDetector(name, _without_common_errors(name, team))
+        correction = CameraCorrection(name, team)
     return SensingAgent(settings, source, map_names, follower, detector, camera, correction)
+
+
+def _without_common_errors(name: str, team: Team) -> Team:
+    """The team whose robot states the sigmas of its sightings without the errors that all of them
+    have in common, where its filter keeps these apart."""
+    settings = team.robots[name]
+    if not considers_camera(settings, settings.camera):
+        return team
+    camera = replace(settings.camera, yaw_sigma_deg=0.0, focal_share=0.0)
+    return replace(team, robots={**team.robots, name: replace(settings, camera=camera)})

@@ -61,10 +61,10 @@ class CameraSettings(Table, frozen=True, kw_only=True):
     limits ranges from foot points."""
     roll_sigma_deg: NotNegative = 1.0
     """The accuracy of the roll, for the same reasons."""
-    yaw_sigma_deg: NotNegative = 0.1
-    """The accuracy of the yaw; it is added to the sigma of every bearing."""
-    focal_share: NotNegative = 0.005
-    """The accuracy of the focal length as a share; it is added to the sigma of every range."""
+    yaw_sigma_deg: NotNegative = 2.0
+    """The accuracy of the yaw: an error that all bearings have in common."""
+    focal_share: NotNegative = 0.025
+    """The accuracy of the focal length as a share: an error that all ranges have in common."""
 
     self_calibration: bool = True
     """Whether the robot corrects its yaw and its focal length while it drives, where landmarks and

@@ -28,10 +28,11 @@ from benchmarks.degraded_frames import (
 )
 from rich.console import Console
 from rich.table import Table
+from support.cameras import calibrated
 
 from cpcbl_agents.vision.detections import Detections
 from cpcbl_agents.vision.detector import CameraDetector
-from cpcbl_team.config import CameraSettings, MarkerFamily, RobotSettings, Team, VisionSettings
+from cpcbl_team.config import MarkerFamily, RobotSettings, Team, VisionSettings
 from cpcbl_team.inputs import Sighting
 
 SUBJECT = "r0"
@@ -93,7 +94,7 @@ def measured(
     seed: int = 1,
 ) -> Score:
     """The detector, and its peers, on frames of one kind."""
-    team, settings = marked_team(family), CameraSettings()
+    team, settings = marked_team(family), calibrated()
     detector = CameraDetector("me", team)
     random = np.random.default_rng([seed, KINDS.index(kind)])
     errors: dict[str, list[float]] = {quantity: [] for quantity in QUANTITIES}
@@ -136,7 +137,7 @@ def false_markers(
 ) -> int:
     """The markers that the detector sees in parts of pictures that have none: sightings, and
     markers of nobody."""
-    team, settings, random = marked_team(family), CameraSettings(), np.random.default_rng(seed)
+    team, settings, random = marked_team(family), calibrated(), np.random.default_rng(seed)
     detector = CameraDetector("me", team)
     false = 0
     for _ in range(frames):

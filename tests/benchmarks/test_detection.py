@@ -23,13 +23,13 @@ from benchmarks.visibility import (
 )
 from msgspec.structs import replace
 from support.benchmarks import run_benchmark
+from support.cameras import calibrated
 
 from cpcbl_agents.vision.camera import Camera, Floats, Pixels
 from cpcbl_launch.simulation.camera.render import Light, render
-from cpcbl_team.config import CameraSettings
 from cpcbl_team.inputs import Sighting
 
-CAMERA = Camera(CameraSettings())
+CAMERA = Camera(calibrated())
 PNG = b"\x89PNG\r\n\x1a\n"
 CLEAN = Light(gradient=0.0, blur_px=0.0, noise=0.0)
 

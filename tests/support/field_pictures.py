@@ -20,6 +20,7 @@ from cpcbl_team.config import (
     Team,
 )
 from cpcbl_team.geometry import Pose2
+from support.cameras import calibrated
 
 CLEAN = Light(gradient=0.0, blur_px=0.0, noise=0.0)
 USUAL = Light()
@@ -32,7 +33,7 @@ def team_of(
     camera: CameraSettings | None = None,
 ) -> Team:
     """Landmarks (x m, y m, colours) and robots with masts, all with the same camera."""
-    camera = camera or CameraSettings()
+    camera = camera or calibrated()
     return Team(
         name="pictures",
         robots={

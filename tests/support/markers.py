@@ -22,6 +22,7 @@ from cpcbl_team.config import (
 )
 from cpcbl_team.geometry import Pose2, wrap_angle
 from cpcbl_team.inputs import Sighting
+from support.cameras import calibrated
 
 ORIGIN = Pose2(0.0, 0.0, 0.0)
 SIDES: tuple[Side, ...] = ("front", "left", "back", "right")
@@ -57,13 +58,13 @@ def picture(
     seed: int = 1,
 ) -> Pixels:
     """What the camera of a robot at the origin sees of these."""
-    camera, random = Camera(settings or CameraSettings()), np.random.default_rng(seed)
+    camera, random = Camera(settings or calibrated()), np.random.default_rng(seed)
     return render(Scene.of(team), camera, ORIGIN, robots, light or Light(), random)
 
 
 def looked(team: Team, pixels: Pixels, settings: CameraSettings | None = None) -> Detections:
     """What `me` makes of a frame."""
-    return MarkerDetector("me", team, Camera(settings or CameraSettings())).detections(pixels)
+    return MarkerDetector("me", team, Camera(settings or calibrated())).detections(pixels)
 
 
 def seen_at(robot: Pose2, side: Side, vision: VisionSettings) -> Floats:

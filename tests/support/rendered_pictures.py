@@ -22,14 +22,15 @@ from cpcbl_team.config import (
     Wall,
 )
 from cpcbl_team.geometry import Pose2
+from support.cameras import calibrated
 
 CLEAN = Light(gradient=0.0, blur_px=0.0, noise=0.0)
 LENS = (-0.28, 0.09, 0.002, -0.001, 0.0)
 CAMERAS = [
-    CameraSettings(),
-    CameraSettings(tilt_deg=12.0, roll_deg=9.0, yaw_deg=15.0, x_m=0.1, y_m=-0.05, mounted_m=0.6),
-    CameraSettings(distortion=LENS, tilt_deg=4.0),
-    CameraSettings(roll_deg=90.0, mounted_m=0.31),
+    calibrated(),
+    calibrated(tilt_deg=12.0, roll_deg=9.0, yaw_deg=15.0, x_m=0.1, y_m=-0.05, mounted_m=0.6),
+    calibrated(distortion=LENS, tilt_deg=4.0),
+    calibrated(roll_deg=90.0, mounted_m=0.31),
 ]
 POSE = Pose2(1.0, 2.0, 0.7)
 SHAPE = Cylinder()
@@ -68,7 +69,7 @@ def picture(
     seed: int = 1,
 ) -> Pixels:
     scene = Scene.of(subject) if isinstance(subject, Team) else subject
-    eye = Camera(camera or CameraSettings())
+    eye = Camera(camera or calibrated())
     return render(scene, eye, POSE, robots, light, np.random.default_rng(seed))
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cpcbl_agents.vision.camera import wrap_angles
-from cpcbl_agents.vision.camera_errors import CameraErrors
+from cpcbl_team.camera_errors import CameraErrors
 from cpcbl_team.config import OdometryNoise, Start
 from cpcbl_team.estimate import ZERO3, Estimate
 from cpcbl_team.geometry import Pose2

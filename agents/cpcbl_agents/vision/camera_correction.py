@@ -6,7 +6,8 @@ from collections import Counter
 import msgspec
 
 from cpcbl_agents.vision.camera_check import CameraCheck, Estimated
-from cpcbl_agents.vision.camera_errors import NO_ERRORS, CameraErrors, without_errors
+from cpcbl_team.camera_errors import NO_ERRORS, CameraErrors, without_errors
+from cpcbl_team.camera_filter import considers_camera
 from cpcbl_team.config import RobotSettings, Team
 from cpcbl_team.estimate import Estimate
 from cpcbl_team.geometry import Pose2, step
@@ -15,6 +16,7 @@ from cpcbl_team.inputs import InputsMended, Odometry, Sighting, Sightings
 SIGMAS = 4.0  # of an error that is believed
 LEAST = CameraErrors(math.radians(1.0), 0.02)  # less may come of a map that is not exact
 LEAST_CHANGE = CameraErrors(math.radians(0.2), 0.003)  # of a correction
+BEYOND_SIGMAS = 3.0  # an error that is larger is none that the filter reckons with
 USUAL_RANGE_M = 2.0  # at which a wrong focal length has moved the robot
 
 
@@ -29,7 +31,13 @@ class CameraCorrection:
         if settings.odometry.moves or start is None or not start.known:
             start = None
         self._check = CameraCheck(places, settings.odometry, self._axis, start)
-        self._corrects = settings.camera.self_calibration
+        camera = settings.camera
+        self._corrects = camera.self_calibration
+        self._least_change, self._leaves_to_filter = LEAST_CHANGE, False
+        if considers_camera(settings, camera):
+            sigmas = math.radians(camera.yaw_sigma_deg), camera.focal_share
+            self._least_change = CameraErrors(*(BEYOND_SIGMAS * s for s in sigmas))
+            self._leaves_to_filter = True
         self._guess: Pose2 | None = None
         self.found: Estimated | None = None
         """The errors of the camera, once one of them was clear."""
@@ -81,7 +89,7 @@ class CameraCorrection:
 
     def _corrected(self, s: Sighting) -> Sighting:
         s = without_errors(s, self._applied, self._axis)
-        if self._sigmas == NO_ERRORS or s.bearing_sigma_rad is None:
+        if self._sigmas == NO_ERRORS or self._leaves_to_filter or s.bearing_sigma_rad is None:
             return s
         bearing_sigma = math.hypot(s.bearing_sigma_rad, self._sigmas.yaw_rad)
         range_sigma = s.range_sigma_m
@@ -105,7 +113,7 @@ class CameraCorrection:
             return InputsMended(stamp_ns) if is_first else None
         now = CameraErrors(*map(_believed, errors, sigmas))
         changes = [a - b for a, b in zip(now, self._applied, strict=True)]
-        if not any(abs(c) > least for c, least in zip(changes, LEAST_CHANGE, strict=True)):
+        if not any(abs(c) > least for c, least in zip(changes, self._least_change, strict=True)):
             return None
         turn, focal = changes
         self._applied = now

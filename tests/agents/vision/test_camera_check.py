@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from cpcbl_agents.vision.camera_correction import CameraCorrection
-from cpcbl_agents.vision.camera_errors import NO_ERRORS, CameraErrors, without_errors
+from cpcbl_team.camera_errors import NO_ERRORS, CameraErrors, without_errors
 from cpcbl_team.config import (
     CameraSettings,
     Field,
@@ -48,10 +48,21 @@ class Drive(NamedTuple):
     corrects: bool = True
     has_exact_start: bool = False
     misplaced: str = ""
+    stated: tuple[float, float] = (
+        0.0,
+        0.0,
+    )  # sigmas of yaw (deg) and focal length; then the filter
+    # knows of these errors
 
 
 def correction_of(drive: Drive) -> CameraCorrection:
-    camera = CameraSettings(yaw_deg=math.degrees(drive.axis_rad), self_calibration=drive.corrects)
+    yaw_sigma_deg, focal_share = drive.stated
+    camera = CameraSettings(
+        yaw_deg=math.degrees(drive.axis_rad),
+        self_calibration=drive.corrects,
+        yaw_sigma_deg=yaw_sigma_deg,
+        focal_share=focal_share,
+    )
     sigmas = (0.0, 0.0) if drive.has_exact_start else (0.02, 0.3)
     start = Start(x_m=3.0, y_m=2.0, sigma_m=sigmas[0], heading_sigma_deg=sigmas[1])
     odometry = replace(NOISE, moves=drive.moves)
@@ -179,6 +190,25 @@ def test_a_right_camera_is_not_blamed(drive: Drive) -> None:
         assert correction.problems == ()
         assert not changes
         assert correction.counts["camera_miscalibrated"] == 0
+
+
+@pytest.mark.parametrize("errors", [YAW, FOCAL], ids=str)
+def test_an_error_that_the_filter_reckons_with_is_named_and_left_to_it(
+    errors: CameraErrors,
+) -> None:
+    correction, changes = run(Drive(errors, stated=(2.0, 0.025)))
+    assert correction.counts["camera_miscalibrated"] == 1
+    assert not changes
+    read = Sighting("ne", 3.0, 0.3, 0.03, 0.005)
+    frame, _ = correction.correct(Sightings(10**12, (read,)))
+    assert frame.sightings == (read,)
+
+
+@pytest.mark.parametrize("errors", [YAW, FOCAL], ids=str)
+def test_an_error_of_many_sigmas_is_corrected(errors: CameraErrors) -> None:
+    _, changes = run(Drive(errors, stated=(0.1, 0.005)))
+    assert sum(c.turn_rad for c in changes) == pytest.approx(errors.yaw_rad, abs=math.radians(1.0))
+    assert changes
 
 
 def test_what_is_known_is_taken_from_the_sightings() -> None:

@@ -5,6 +5,7 @@ import math
 import msgspec
 import numpy as np
 import pytest
+from support.cameras import calibrated
 from support.field_pictures import (
     HERE,
     USUAL,
@@ -29,11 +30,9 @@ from cpcbl_team.config import CameraSettings, Cylinder, Team
 from cpcbl_team.geometry import Pose2, wrap_angle
 
 RED_YELLOW, YELLOW_RED, BLUE_PINK = ("red", "yellow"), ("yellow", "red"), ("blue", "pink")
-TILTED = CameraSettings(
-    x_m=0.12, y_m=-0.05, mounted_m=0.35, tilt_deg=12.0, roll_deg=4.0, yaw_deg=25.0
-)
-HIGH = CameraSettings(mounted_m=0.4, tilt_deg=5.0)
-BENT = CameraSettings(fx_px=500.0, fy_px=505.0, distortion=(-0.25, 0.08, 0.001, -0.001, 0.0))
+TILTED = calibrated(x_m=0.12, y_m=-0.05, mounted_m=0.35, tilt_deg=12.0, roll_deg=4.0, yaw_deg=25.0)
+HIGH = calibrated(mounted_m=0.4, tilt_deg=5.0)
+BENT = calibrated(fx_px=500.0, fy_px=505.0, distortion=(-0.25, 0.08, 0.001, -0.001, 0.0))
 
 
 def ids(detections: Detections) -> list[str]:
@@ -44,7 +43,7 @@ def reasons(detections: Detections) -> dict[str, tuple[str, ...]]:
     return {ambiguity.reason: ambiguity.names for ambiguity in detections.ambiguities}
 
 
-@pytest.mark.parametrize("camera", [CameraSettings(), TILTED, BENT])
+@pytest.mark.parametrize("camera", [calibrated(), TILTED, BENT])
 def test_clean_pictures_give_next_to_no_error(camera: CameraSettings) -> None:
     team = team_of({"L": (0.0, 0.0, RED_YELLOW)}, {"me": None, "mate": BLUE_PINK}, camera)
     eyes = CylinderDetector("me", team, Camera(camera))
@@ -76,7 +75,7 @@ def test_clean_pictures_give_next_to_no_error(camera: CameraSettings) -> None:
 )
 def test_light_does_not_bias_the_range(light: Light) -> None:
     team = team_of({"L": (0.0, 0.0, BLUE_PINK)})
-    eyes = CylinderDetector("viewer", team, Camera(CameraSettings()))
+    eyes = CylinderDetector("viewer", team, Camera(calibrated()))
     errors = []
     for seed in range(8):
         range_m = 3.9 + 0.03 * seed
@@ -94,7 +93,7 @@ def test_poses_in_usual_light_are_honest() -> None:
         "C": (-1.0, 2.0, YELLOW_RED),
     }
     team = team_of(places)
-    eyes = CylinderDetector("viewer", team, Camera(CameraSettings()))
+    eyes = CylinderDetector("viewer", team, Camera(calibrated()))
     random, angles = np.random.default_rng(2), 0
     for seed in range(40):
         x, y, heading = (float(v) for v in random.uniform(-1.0, 1.0, 3) * (1.0, 1.0, math.pi))
@@ -116,7 +115,7 @@ def test_poses_in_usual_light_are_honest() -> None:
 
 def test_near_and_central_is_better_than_far_and_oblique() -> None:
     team = team_of({"L": (0.0, 0.0, RED_YELLOW)})
-    eyes = CylinderDetector("viewer", team, Camera(CameraSettings()))
+    eyes = CylinderDetector("viewer", team, Camera(calibrated()))
 
     def sigmas(range_m: float, bearing: float) -> tuple[float, float]:
         (one,) = eyes.detections(picture(team, Pose2(-range_m, 0.0, -bearing))).found
@@ -243,7 +242,7 @@ def test_mirror_image_alone(known: tuple[str, str]) -> None:
 
 def test_cut_by_the_side_of_the_frame() -> None:
     team = team_of({"L": (1.0, 0.0, RED_YELLOW)})
-    eyes = CylinderDetector("viewer", team, Camera(CameraSettings()))
+    eyes = CylinderDetector("viewer", team, Camera(calibrated()))
     edge = math.atan2(319.5, 400.0)
     angles = {True: 0, False: 0}
     for off in np.linspace(-0.09, 0.045, 16):
@@ -269,7 +268,7 @@ def test_too_near_to_be_seen_whole() -> None:
 
 
 def test_foot_below_the_frame_leaves_the_bearing() -> None:
-    up = CameraSettings(tilt_deg=-22.0)
+    up = calibrated(tilt_deg=-22.0)
     team = team_of({"L": (1.2, 0.1, RED_YELLOW)}, camera=up)
     (one,) = detections_in(team, picture(team)).found
     assert one.sighting.range_m is None
@@ -307,7 +306,7 @@ def test_unknown_pair_and_single_band() -> None:
 
 
 def test_too_small() -> None:
-    tiny = CameraSettings(width_px=64, height_px=48, fx_px=40.0, fy_px=40.0, cx_px=31.5, cy_px=23.5)
+    tiny = calibrated(width_px=64, height_px=48, fx_px=40.0, fy_px=40.0, cx_px=31.5, cy_px=23.5)
     team = team_of({"L": (2.9, 0.0, RED_YELLOW)}, camera=tiny)
     wide = msgspec.structs.replace(team.vision, landmark=Cylinder(radius_m=0.2))
     team = msgspec.structs.replace(team, vision=wide)
@@ -325,7 +324,7 @@ def test_empty_pictures(level: int) -> None:
 def test_nothing_is_found_in_noise_stripes_and_one_colour() -> None:
     colours = {"L": (2.0, 0.0, RED_YELLOW), "M": (3.0, 0.0, YELLOW_RED), "N": (4.0, 0.0, BLUE_PINK)}
     team = team_of(colours)
-    eyes = CylinderDetector("viewer", team, Camera(CameraSettings()))
+    eyes = CylinderDetector("viewer", team, Camera(calibrated()))
     random = np.random.default_rng(4)
     red, yellow = (30, 30, 200), (30, 200, 200)
     stripes = np.tile(np.array([[red]] * 12 + [[yellow]] * 12, np.uint8), (20, 640, 1))

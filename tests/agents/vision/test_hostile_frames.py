@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 import pytest
 from msgspec.structs import replace
+from support.cameras import calibrated
 from support.hostile_frames import tiles, turned_marker
 from support.markers import CARRIED, picture, standing, team
 from support.rendered_pictures import picture as field_picture
@@ -25,7 +26,7 @@ from cpcbl_team.config import CameraSettings
 from cpcbl_team.inputs import Sightings
 from cpcbl_transport.messages import UnclearObject
 
-TEAM, CAMERA = team(CARRIED), CameraSettings()
+TEAM, CAMERA = team(CARRIED), calibrated()
 
 
 @pytest.mark.parametrize("side_px", [6, 8, 10, 12, 16])

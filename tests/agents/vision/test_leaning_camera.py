@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 from msgspec.structs import replace
+from support.cameras import calibrated
 from support.markers import CARRIED, looked, off, picture, seen_at, standing, team
 from support.rendered_pictures import CLEAN, post
 from support.rendered_pictures import picture as field_picture
@@ -19,7 +20,7 @@ from cpcbl_agents.vision.poses import Lean, PoseFit, fit_pose
 from cpcbl_team.config import CameraSettings, VisionSettings
 from cpcbl_team.geometry import Pose2, wrap_angle
 
-STATED = CameraSettings()
+STATED = calibrated()
 TEAM = team(CARRIED)
 PLACES = [(1.0, -18.0, 160.0), (1.8, 2.0, -150.0), (2.6, 20.0, 175.0)]
 ROBOTS = [standing(f"r{k}", *place) for k, place in enumerate(PLACES, start=1)]

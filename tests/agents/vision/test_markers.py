@@ -7,13 +7,14 @@ import cv2
 import numpy as np
 import pytest
 from msgspec.structs import replace
+from support.cameras import calibrated
 from support.markers import CARRIED, looked, off, picture, standing, team
 
 from cpcbl_agents.vision.detections import Detections
 from cpcbl_launch.simulation.camera.render import Light, SceneRobot
-from cpcbl_team.config import CameraSettings, MarkerFamily
+from cpcbl_team.config import MarkerFamily
 
-CAMERA = CameraSettings()
+CAMERA = calibrated()
 TEAM = team(CARRIED)
 LENSES = {
     "straight": CAMERA,

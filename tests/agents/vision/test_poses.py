@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
+from support.cameras import calibrated
 from support.markers import SIDES, seen_at
 
 from cpcbl_agents.vision.camera import Camera, Floats
@@ -17,9 +18,9 @@ from cpcbl_team.geometry import Pose2, wrap_angle
 VISION = VisionSettings()
 LENS = (-0.28, 0.09, 0.002, -0.001, 0.0)
 CAMERAS = [
-    CameraSettings(),
-    CameraSettings(tilt_deg=12.0, roll_deg=9.0, yaw_deg=15.0, x_m=0.1, y_m=-0.05, mounted_m=0.6),
-    CameraSettings(distortion=LENS, tilt_deg=4.0, roll_deg=90.0),
+    calibrated(),
+    calibrated(tilt_deg=12.0, roll_deg=9.0, yaw_deg=15.0, x_m=0.1, y_m=-0.05, mounted_m=0.6),
+    calibrated(distortion=LENS, tilt_deg=4.0, roll_deg=90.0),
 ]
 
 
@@ -59,7 +60,7 @@ def test_exact_corners_tell_the_pose(
     if sigmas[2] < NARROW:  # what is told is one pose, not the middle of many
         assert math.hypot(x, y) < 2e-3
         assert abs(turn) < 5e-3
-    assert len(seen) < 2 or sigmas[2] < NARROW
+    assert len(seen) < 2 or sigmas[2] < 1.5 * NARROW
     assert (np.abs([x, y, turn]) < 3.0 * sigmas).all()
 
 

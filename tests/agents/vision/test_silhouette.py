@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from support.cameras import calibrated
 
 from cpcbl_agents.vision.camera import Camera, Panorama
 from cpcbl_agents.vision.cylinder_fit import (
@@ -103,9 +104,9 @@ def test_hidden_foot_of_a_mast_costs_certainty() -> None:
 @pytest.mark.parametrize(
     "settings",
     [
-        CameraSettings(),
-        CameraSettings(mounted_m=0.35, tilt_deg=14.0, roll_deg=-6.0, yaw_deg=30.0),
-        CameraSettings(tilt_deg=5.0, distortion=(-0.28, 0.09, 0.002, -0.001, -0.01)),
+        calibrated(),
+        calibrated(mounted_m=0.35, tilt_deg=14.0, roll_deg=-6.0, yaw_deg=30.0),
+        calibrated(tilt_deg=5.0, distortion=(-0.28, 0.09, 0.002, -0.001, -0.01)),
     ],
 )
 def test_a_projected_cylinder_looks_as_said(settings: CameraSettings) -> None:

@@ -37,6 +37,9 @@ class Cameras:
             name: with_focal_error(team.robots[name].camera, self._noise, random)
             for name, random in self._random.items()
         }
+        for i, name in enumerate(self._cameras):
+            random = np.random.default_rng((seed, _SEED, i, 1))
+            self._cameras[name] = with_yaw_error(self._cameras[name], self._noise, random)
         guards = team.transport.guards
         allowed = guards.largest_frame_bytes if guards.enabled else LARGEST_FRAME
         self._largest = min(allowed, LARGEST_FRAME) - HEAD_BYTES
@@ -57,6 +60,14 @@ def with_focal_error(
     """The settings with a random error of the focal length; its sigma is scaled by `noise`."""
     share = 1.0 + noise * camera.focal_share * float(random.normal())
     return replace(camera, fx_px=camera.fx_px * share, fy_px=camera.fy_px * share)
+
+
+def with_yaw_error(
+    camera: CameraSettings, noise: float, random: np.random.Generator
+) -> CameraSettings:
+    """The settings with a random error of the yaw that stays; its sigma is scaled by `noise`."""
+    yaw = noise * camera.yaw_sigma_deg * float(random.normal())
+    return replace(camera, yaw_deg=camera.yaw_deg + yaw, yaw_sigma_deg=0.0)
 
 
 def with_mount_error(

@@ -48,3 +48,13 @@ def without_errors(sighting: Sighting, errors: CameraErrors, axis_rad: float) ->
         range_sigma_m=None if sigma is None else stretch * sigma,
         heading_rad=None if heading is None else wrap_angle(heading + turn),
     )
+
+
+def range_sensitivity(range_m: float, off_axis_rad: float) -> tuple[float, float]:
+    """The derivatives of a range by yaw and focal length: (m/rad, m)."""
+    return 0.0, -range_m * math.cos(off_axis_rad) ** 2
+
+
+def bearing_sensitivity(off_axis_rad: float) -> tuple[float, float]:
+    """The derivatives of a bearing by yaw and focal length: (1, rad)."""
+    return 1.0, math.sin(off_axis_rad) * math.cos(off_axis_rad)

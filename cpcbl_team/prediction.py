@@ -1,0 +1,92 @@
+"""Step 1 of the cycle: the state at a later time, by odometry."""
+
+from cpcbl_team.camera_filter import CameraFilter
+from cpcbl_team.config import LocalizationSettings
+from cpcbl_team.geometry import step
+from cpcbl_team.inputs import Odometry
+from cpcbl_team.motion import NO_VARIANCE, bridge, inflate_by_gap, is_gap, part_of_piece
+from cpcbl_team.own_calibration import OwnCalibration
+from cpcbl_team.sensors import time_at_min_speed_s
+from cpcbl_team.state import State, with_motion, with_odometry
+from cpcbl_team.variants import JointVariant
+
+
+class Prediction:
+    """How the pose of one robot follows its odometry."""
+
+    def __init__(
+        self,
+        settings: LocalizationSettings,
+        variant: JointVariant,
+        calibration: OwnCalibration,
+        camera: CameraFilter | None,
+    ) -> None:
+        """`camera`: the one whose errors depend on those of the pose."""
+        self._odometry, self._moves = settings.odometry, settings.odometry.moves
+        self._odometry_timeout_ns = int(settings.odometry.timeout_s * 1e9)
+        self._has_dead_zone = settings.odometry.least_speed_m_s > 0.0
+        self._variant, self._calibration, self._camera = variant, calibration, camera
+
+    def add_odometry(self, state: State, odometry: Odometry) -> State:
+        """Takes the next piece of odometry; predictions for later times will use it."""
+        from_ns, until_ns = odometry.from_ns, odometry.stamp_ns
+        if until_ns <= from_ns:
+            return state.counted("impossible_duration")
+        before = state.odometry
+        if before is not None and from_ns > state.odometry_until_ns:
+            if is_gap(from_ns - state.odometry_until_ns, before, odometry):
+                state = state.counted("odometry_gap")
+            else:
+                state = with_odometry(state, before, from_ns)
+        if from_ns > state.stamp_ns:
+            state = self.predict(state, from_ns, odometry)
+        if before is not None and before.stamp_ns > state.stamp_ns:
+            state = state.counted("odometry_overlap")
+        return with_odometry(state, odometry, max(state.odometry_until_ns, until_ns))
+
+    def predict(self, state: State, until_ns: int, following: Odometry | None = None) -> State:
+        """Step 1: the state at `until_ns`, moved along the known odometry (J C J^T, section 4).
+
+        Where odometry was lost the robot drives on as before; `following` is the piece that begins
+        at `until_ns`, if one does.
+        """
+        stamp_ns, estimate = state.stamp_ns, state.estimate
+        if until_ns <= stamp_ns:
+            return state
+        odometry_from_robot, piece = state.odometry_from_robot, state.odometry
+        if piece is not None and piece.stamp_ns > stamp_ns:
+            distance, turn, seconds = part_of_piece(piece, stamp_ns, until_ns)
+            crawl_s = 0.0
+            if self._has_dead_zone:
+                crawl_s = time_at_min_speed_s(distance, seconds, self._odometry)
+            extra, own = NO_VARIANCE, self._calibration
+            if own.is_known(state):
+                state, distance, turn = own.corrected_motion(state, distance, turn)
+                extra = own.extra_variance(state, distance, turn, crawl_s)
+            if self._camera is not None:
+                state = self._camera.before_motion(state, distance, turn, seconds)
+            if distance != 0.0 or turn != 0.0:
+                odometry_from_robot = step(odometry_from_robot, distance, turn)
+                estimate = self._variant.move(estimate, distance, turn, crawl_s, extra)
+        state = with_motion(state, until_ns, estimate, odometry_from_robot)
+        if self._moves and until_ns > state.odometry_until_ns:
+            return self._across_gap(state, stamp_ns, following)
+        return state
+
+    def _across_gap(self, state: State, from_ns: int, following: Odometry | None) -> State:
+        """The state after the part of a gap in the odometry since `from_ns`."""
+        until_ns, estimate, place, before, begin_ns, _, _ = state
+        gap_ns = until_ns - begin_ns
+        from_s = max(from_ns - begin_ns, 0) * 1e-9
+        distance, turn, extra = bridge(before, following, from_s, gap_ns * 1e-9, self._odometry)
+        if self._calibration.is_known(state):
+            state, distance, turn = self._calibration.corrected_motion(state, distance, turn)
+        if distance != 0.0 or turn != 0.0 or extra != NO_VARIANCE:
+            if self._camera is not None:
+                state = self._camera.before_motion(state, distance, turn, 0.0)
+            place = step(place, distance, turn)
+            estimate = self._variant.move(estimate, distance, turn, 0.0, extra)
+        silent_ns = min(gap_ns - self._odometry_timeout_ns, until_ns - from_ns)
+        if silent_ns > 0:
+            estimate = inflate_by_gap(estimate, silent_ns, before, self._odometry.gap_speed_m_s)
+        return with_motion(state, until_ns, estimate, place)
