@@ -29,6 +29,7 @@ HOT = (
     "prediction",
     "range_errors",
     "recovery",
+    "recovery_evidence",
     "relocalization",
     "sensors",
     "state",

@@ -39,12 +39,11 @@ from cpcbl_team.mended_inputs import with_mended_inputs
 from cpcbl_team.object_timers import ObjectTimers, has_passed
 from cpcbl_team.own_calibration import OwnCalibration
 from cpcbl_team.prediction import Prediction
-from cpcbl_team.recovery import (
-    Recovery,
+from cpcbl_team.recovery import Recovery, with_innovations
+from cpcbl_team.recovery_evidence import (
     evidence_from_observation,
     recently_recorded,
     with_evidence,
-    with_innovations,
     with_measurements,
     with_snapshot,
 )

@@ -29,7 +29,7 @@ from cpcbl_team.miscalibration import (
 )
 from cpcbl_team.motion import NO_VARIANCE, MotionVariance, distance_variance, turn_variance
 from cpcbl_team.range_errors import NO_RANGE_ERRORS, RangeErrors, Seen
-from cpcbl_team.recovery import SPACING_NS
+from cpcbl_team.recovery_evidence import SPACING_NS
 from cpcbl_team.self_calibration import ReferencePose, ReferencePoses, self_calibrate
 from cpcbl_team.state import CalibrationMemory, Evidence, Memory, RecoveryMemory, State, with_memory
 

@@ -26,7 +26,8 @@ from cpcbl_team.measurements import (
     nearest_belief,
     observation_of,
 )
-from cpcbl_team.recovery import inflate_by_offset, inflate_to, without_senders
+from cpcbl_team.recovery import inflate_by_offset, inflate_to
+from cpcbl_team.recovery_evidence import without_senders
 from cpcbl_team.sender_comparisons import OWN_SENSORS, RECENT_NS, SenderRecords
 from cpcbl_team.sender_records import NEVER_NS, OffsetEvidence, ReportedPosition, TeammateReport
 from cpcbl_team.state import State, with_memory, with_senders, with_teammates

@@ -12,8 +12,8 @@ from cpcbl_team.config import Field, Landmark, SensorSettings
 from cpcbl_team.estimate import Estimate
 from cpcbl_team.geometry import Pose2
 from cpcbl_team.inputs import Sighting, Sightings
-from cpcbl_team.recovery import agrees
 from cpcbl_team.sensors import range_sigma_m
+from cpcbl_team.trusted_pose import agrees
 
 ORIGIN = Pose2(0.0, 0.0, 0.0)
 RANGE_M = 4.0  # of the object, straight ahead

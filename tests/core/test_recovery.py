@@ -45,17 +45,14 @@ from cpcbl_team.inputs import Sighting, Sightings
 from cpcbl_team.measurements import Measurement, ObjectPosition
 from cpcbl_team.miscalibration import Adaptation, noise_with_factor
 from cpcbl_team.range_errors import RangeErrors
-from cpcbl_team.recovery import (
+from cpcbl_team.recovery import Limits, inflate_covariance, lost_reason, with_innovations
+from cpcbl_team.recovery_evidence import (
     MOST_PIECES,
     SPACING_NS,
     WINDOW_NS,
-    Limits,
     evidence_from_measurement,
     evidence_from_observation,
-    inflate_covariance,
-    lost_reason,
     with_evidence,
-    with_innovations,
     with_measurements,
 )
 from cpcbl_team.relocalization import relocalize

@@ -11,7 +11,7 @@ from support.evidence import piece
 from cpcbl_team.config import Gives, OdometrySettings
 from cpcbl_team.estimate import Estimate
 from cpcbl_team.geometry import Pose2, step
-from cpcbl_team.recovery import SPACING_NS
+from cpcbl_team.recovery_evidence import SPACING_NS
 from cpcbl_team.relocalization import relocalize
 from cpcbl_team.state import Evidence
 
