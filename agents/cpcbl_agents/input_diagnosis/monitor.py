@@ -45,7 +45,7 @@ WINDOW = 10  # judgements, one a second: shares are those of the last so many
 SETTLED_NS = 2_000_000_000  # what was on its way when the robot started is too late
 OFTEN, SELDOM = 20, 10
 """The search for implausible inputs takes some milliseconds. It runs at each of the first `OFTEN`
-judgements and while it finds something, later at every tenth one (`SELDOM`)."""
+judgements, while it finds something and while the robot is lost, else at every tenth one."""
 SECOND_NS, EMPTY_NS = 1_000_000_000, 5_000_000_000
 UNSEEN = 25  # judgements: in real logs a robot saw nothing for 20 s in front of landmarks
 EMPTY_CAME = "empty frames came too before"
@@ -249,7 +249,8 @@ class InputMonitor:
         )
         problems = input_problems(facts)
         self._judgements += any(self.inputs[name].messages for name in shown)
-        if self._hysteresis or self._judgements < OFTEN or self._judgements % SELDOM == 0:
+        is_early = self._judgements < OFTEN
+        if self._hysteresis or is_early or snapshot.lost or self._judgements % SELDOM == 0:
             self._implausible = self._find_implausible(snapshot, facts, before, bool(problems))
         are_wrong = bool(self._implausible) or any(map(is_often_refused, facts.windows.values()))
         self.are_mended, self._are_wrong = self._are_wrong and not are_wrong, are_wrong
