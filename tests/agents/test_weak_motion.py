@@ -113,7 +113,6 @@ def test_a_mistake_in_a_run_is_said_and_forgotten_once_it_is_mended(name: str) -
         *((f"sightings: {what}", SPIN, 6.0) for what in ("backwards", "from the camera's x")),
         ("sightings: to the right", SPIN, 6.0),
         ("odometry: feet", ALL_ROUND, 32.0),
-        ("odometry: km/h", ALL_ROUND, 32.0),
     ],
 )
 def test_a_mistake_in_a_run_is_said_of_a_robot_that_only_turns_or_sees_all_round(

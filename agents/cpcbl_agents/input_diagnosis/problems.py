@@ -332,15 +332,8 @@ def _motion(
     reported = facts.reported_by_start.get(MOTION)
     if facts.near_start is None and not is_right and reported:
         return reported
-    if facts.near_start is not None and frames:
-        latest = [f for f in frames[-10:] if frames[-1].stamp_ns - f.stamp_ns < LATEST_NS]
-        if cause := motions.view_cause(latest, facts.near_start, marks, tolerance):
-            return f"sightings: {cause}"
-    start = facts.start if facts.is_from_start and not is_right else None
-    if start is not None and (cause := turned_view_cause(frames, steps, start, marks)):
+    if cause := _view_cause(facts, frames, steps, tolerance, is_right):
         return f"sightings: {cause}"
-    if facts.mistake and not is_right:
-        return f"sightings: {facts.mistake}; {OR_MOVED}"
     spans_s = (steps[-1].stamp_ns - steps[0].from_ns) * 1e-9 if steps else math.inf
     if resightings or (
         spans_s < WAIT_S and any(s.id in marks for f in frames for s in f.sightings)
@@ -348,6 +341,27 @@ def _motion(
         return ""  # what landmarks show is known better, or soon
     cause = causes.odometry_cause(pieces)
     return cause and f"odometry: {cause}"
+
+
+def _view_cause(
+    facts: InputFacts,
+    frames: Sequence[Sightings],
+    steps: Sequence[Step],
+    tolerance: float,
+    is_right: bool,
+) -> str:
+    """What is wrong with sightings, by the map and a pose: the start, or that of the filter."""
+    marks = facts.landmarks
+    if facts.near_start is not None and frames:
+        latest = [f for f in frames[-10:] if frames[-1].stamp_ns - f.stamp_ns < LATEST_NS]
+        if cause := motions.view_cause(latest, facts.near_start, marks, tolerance):
+            return cause
+    if is_right:
+        return ""
+    start = facts.start if facts.is_from_start else None
+    if start is not None and (cause := turned_view_cause(frames, steps, start, marks)):
+        return cause
+    return f"{facts.mistake}; {OR_MOVED}" if facts.mistake else ""
 
 
 def _shift_of_landmarks(
