@@ -11,6 +11,7 @@ from statistics import median
 from typing import NamedTuple, TypeVar
 
 from cpcbl_agents.input_diagnosis.implausible_errors import ImplausibleErrors
+from cpcbl_agents.input_diagnosis.jumps import JumpMonitor
 from cpcbl_agents.input_diagnosis.motion_causes import (
     CONTRADICTION,
     OR_START,
@@ -24,7 +25,6 @@ from cpcbl_agents.input_diagnosis.problems import (
     implausible_inputs,
     input_problems,
     is_often_refused,
-    jump_problems,
     without_numbers,
 )
 from cpcbl_agents.robot import InputSnapshot
@@ -205,6 +205,7 @@ class InputMonitor:
             and settings.sensor.sees_landmarks
         )
         self._starts_known: bool | None = None
+        self._jumps = JumpMonitor(start_ns, settings.odometry.moves)
         self._errors = ImplausibleErrors()
         self._hysteresis, self._implausible = ProblemHysteresis(), tuple[str, ...]()
         self.are_mended = self._are_wrong = False
@@ -256,7 +257,8 @@ class InputMonitor:
         self.are_mended, self._are_wrong = self._are_wrong and not are_wrong, are_wrong
         health = tuple(self._health(name, totals, before) for name in shown)
         said = (*problems, *self._implausible)
-        return health, said or jump_problems(snapshot.jump, now_ns)
+        jumps = self._jumps.judge(snapshot.jump, self.inputs["odometry"].steps, now_ns)
+        return health, said or jumps
 
     def _find_implausible(
         self, snapshot: InputSnapshot, facts: InputFacts, before: _Totals, has_problems: bool

@@ -18,7 +18,6 @@ from cpcbl_team.config import Landmark, OdometryNoise, SensorSettings
 from cpcbl_team.errors import nearest_name
 from cpcbl_team.geometry import Pose2
 from cpcbl_team.inputs import Odometry, Position, Sightings
-from cpcbl_team.state import Jump
 from cpcbl_team.trusted_pose import OR_MOVED
 from cpcbl_transport.decoding import decode_by_key, input_problem
 from cpcbl_transport.messages import LARGEST_NUMBER, Frame, SensorInput
@@ -29,7 +28,6 @@ REFUSED_SHARE = 0.05
 LEAST_REFUSED = 3  # a single message may be damaged, or late
 MOST_TOLERANCE = 0.4  # of where a landmark is seen again, as a share of its range
 LATEST_NS = 600_000_000
-JUMP_NS = 15_000_000_000  # for so long a jump of the pose is reported
 WAIT_S = 7.0  # for what landmarks show
 LARGEST_ANGLE = 7.0
 LEAST_COVERED = 0.8  # of the time, by odometry
@@ -77,7 +75,6 @@ STAMPS = {"from_the_future", "too_late", "impossible_duration", "implausible_num
 
 MOTION, OVERLAP, POSITION = "motion", "overlap", "position"  # what implausible inputs are about
 CALIBRATION = "calibration"
-JUMPED = "jumped by"
 
 
 class InputWindow(NamedTuple):
@@ -127,17 +124,6 @@ def input_problems(facts: InputFacts) -> tuple[str, ...]:
 def implausible_inputs(facts: InputFacts) -> dict[str, str]:
     """What no reason refuses, although it cannot be true, by what it is about."""
     return {about: text for about, text in _implausible(facts) if text}
-
-
-def jump_problems(jump: Jump | None, now_ns: int) -> tuple[str, ...]:
-    """What is said of a late jump of the pose, while nothing else says its cause."""
-    if jump is None or now_ns - jump.stamp_ns > JUMP_NS:
-        return ()
-    moved = f"{jump.distance_m:.1f} m and {abs(math.degrees(jump.turn_rad)):.0f}°"
-    return (
-        f"the pose {JUMPED} {moved} without odometry: the robot was carried, its `start` is"
-        " elsewhere, or its odometry or sightings are wrong",
-    )
 
 
 def without_numbers(problem: str) -> str:
@@ -361,7 +347,8 @@ def _view_cause(
     start = facts.start if facts.is_from_start else None
     if start is not None and (cause := turned_view_cause(frames, steps, start, marks)):
         return cause
-    return f"{facts.mistake}; {OR_MOVED}" if facts.mistake else ""
+    is_named = facts.mistake not in ("", mistakes.FIXED)  # what does not turn, motion tells better
+    return f"{facts.mistake}; {OR_MOVED}" if is_named else ""
 
 
 def _shift_of_landmarks(
