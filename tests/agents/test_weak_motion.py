@@ -125,6 +125,21 @@ def test_a_mistake_in_a_run_is_said_of_a_robot_that_only_turns_or_sees_all_round
     assert is_said(name, MISTAKES[name], robot.problems)
 
 
+@pytest.mark.parametrize(
+    ("name", "seed"),
+    [("odometry: mirrored", 22), ("odometry: mirrored", 23), ("sightings: to the right", 5)],
+)
+def test_a_robot_whose_driver_was_mended_is_not_lost_for_long(name: str, seed: int) -> None:
+    """What it trusted during the mistake must not make its driver look wrong afterwards."""
+    robot = DrivenRobot(SHUTTLE._replace(seed=seed))
+    robot.run(20.0)
+    robot.run(40.0, MISTAKES[name].make())
+    robot.run(45.0)
+    assert robot.problems == ()
+    assert robot.statuses[-1].lost == ""
+    assert robot.is_consistent
+
+
 def test_bearings_of_a_camera_that_looks_elsewhere_are_said_with_their_angle() -> None:
     for world in (STRAIGHT, SPIN):
         robot = DrivenRobot(world)

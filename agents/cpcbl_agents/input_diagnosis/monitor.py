@@ -22,6 +22,7 @@ from cpcbl_agents.input_diagnosis.problems import (
     MOTION,
     InputFacts,
     InputWindow,
+    contradicts_mistake,
     implausible_inputs,
     input_problems,
     is_often_refused,
@@ -209,8 +210,8 @@ class InputMonitor:
         self._errors = ImplausibleErrors()
         self._hysteresis, self._implausible = ProblemHysteresis(), tuple[str, ...]()
         self.are_mended = self._are_wrong = False
-        """Whether inputs were implausible or refused before the last judgement, and are right."""
-        self.has_moved = False
+        """Whether inputs were wrong before the last judgement, and are right."""
+        self.has_moved = self.is_mistake_contradicted = False
         """Whether odometry said so, at a judgement."""
         wheels = settings.odometry
         self.inputs["odometry"].scales = wheels.distance_scale, wheels.turn_scale
@@ -284,6 +285,7 @@ class InputMonitor:
             long_steps=_since_stamp(self.inputs["odometry"].steps, long_ns),
             long_frames=[frame for _, frame in _since(seen.spaced, long_ns)],
         )
+        self.is_mistake_contradicted = contradicts_mistake(facts)
         found = implausible_inputs(facts)
         if has_problems and CONTRADICTION in found.get(MOTION, ""):
             del found[MOTION]

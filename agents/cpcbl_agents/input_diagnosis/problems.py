@@ -11,7 +11,13 @@ from cpcbl_agents.input_diagnosis import message_causes as causes
 from cpcbl_agents.input_diagnosis import motion_causes as motions
 from cpcbl_agents.input_diagnosis.motion_causes import Step
 from cpcbl_agents.input_diagnosis.position_causes import position_cause
-from cpcbl_agents.input_diagnosis.shift_causes import is_same, is_sure, shift_cause, shift_of
+from cpcbl_agents.input_diagnosis.shift_causes import (
+    contradicts_mistakes,
+    is_same,
+    is_sure,
+    shift_cause,
+    shift_of,
+)
 from cpcbl_agents.input_diagnosis.start_causes import turned_view_cause
 from cpcbl_team import sensor_mistakes as mistakes
 from cpcbl_team.config import Landmark, OdometryNoise, SensorSettings
@@ -349,6 +355,15 @@ def _view_cause(
         return cause
     is_named = facts.mistake not in ("", mistakes.FIXED)  # what does not turn, motion tells better
     return f"{facts.mistake}; {OR_MOVED}" if is_named else ""
+
+
+def contradicts_mistake(facts: InputFacts) -> bool:
+    """Whether landmarks move so that no mistake in sightings is left that explains why the robot is
+    lost."""
+    steps = facts.long_steps if facts.mistake and _odometry(facts) else []
+    frames = [_usable(frame) for frame in facts.long_frames]
+    shift = shift_of(frames, steps, facts.landmarks, facts.sensor, facts.wheels)
+    return shift is not None and contradicts_mistakes(shift)
 
 
 def _shift_of_landmarks(
