@@ -3,18 +3,21 @@
 from cpcbl_team.estimate import Covariance3, Estimate
 from cpcbl_team.geometry import Pose2, new, wrap_angle
 from cpcbl_team.inputs import InputsMended
-from cpcbl_team.state import State, with_senders, with_teammates
+from cpcbl_team.state import State, with_recovery, with_senders, with_teammates
 from cpcbl_team.trust import forgive
 
 
 def with_mended_inputs(state: State, event: InputsMended) -> State:
     """The state with its heading turned back, and less certain by what the wrong inputs may have
-    done. The teammates that they made look wrong are no longer blamed."""
+    done. The teammates that they made look wrong are no longer blamed, and the pose from before
+    them is no longer trusted."""
     (x, y, heading), covariance, shared = state.estimate
     p, h = event.position_sigma_m**2, event.turn_rad**2
     grown = covariance.plus(Covariance3(p, 0.0, p, 0.0, 0.0, h))
     pose = new(Pose2, (x, y, wrap_angle(heading + event.turn_rad)))
     state = state._replace(estimate=Estimate(pose, grown, shared))
+    recovery = state.memory.recovery._replace(trusted=None, mistake="")
+    state = with_recovery(state, recovery)
     teammates = state.memory.teammates
     senders = forgive(teammates.senders, event.stamp_ns)
     return with_teammates(state, with_senders(teammates, senders))

@@ -292,10 +292,10 @@ class Node:
         counts = self.counts + Counter(announced=self._declarations.announced)
         received = self.received.flows()
         status = self.robot.status(now_ns, self._incarnation, counts, received, self._clocks)
-        inputs, problems = self._health.judge(
-            self.robot.input_snapshot(), now_ns, bool(self._namesakes)
-        )
-        if self._health.are_mended:
+        snapshot = self.robot.input_snapshot()
+        inputs, problems = self._health.judge(snapshot, now_ns, bool(self._namesakes))
+        is_contradicted = bool(snapshot.mistake) and self._health.is_mistake_contradicted
+        if self._health.are_mended or is_contradicted:
             self.robot.forget_wrong_inputs(now_ns)
         overload = self._load.judge(len(self._inbox), self._inbox.pop_dropped())
         problems = (*overload, *problems, *self.robot.sensing.problems)

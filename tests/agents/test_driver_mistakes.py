@@ -14,7 +14,8 @@ from support.drivers import EPOCH, PLACES, Change, DrivenRobot, World, as_it_is
 from support.mistake_rows import ALONE, CIRCLE, GPS, ODOMETRY, SEEN, STAND, START, STOPS, Row
 from support.mistakes import FOOT_M, HeldBack, Kind, of, sent, silent, stamps
 
-from cpcbl_agents.input_diagnosis.problems import JUMPED, without_numbers
+from cpcbl_agents.input_diagnosis.jumps import JUMPED
+from cpcbl_agents.input_diagnosis.problems import without_numbers
 from cpcbl_team.inputs import Odometry, Position, Sightings
 
 

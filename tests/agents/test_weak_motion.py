@@ -28,6 +28,7 @@ SHUTTLE = World(
 ONE = SHUTTLE._replace(places={"se": (4.0, 0.0)}, seed=7)
 SELDOM = SHUTTLE._replace(sightings_hz=1.0, seed=15)
 NOISY = SHUTTLE._replace(range_share=0.1, bearing_deg=4.0, seed=16)
+ALL_ROUND = SHUTTLE._replace(places=PLACES, start=START, view_deg=360.0, seed=6)
 SPIN = World(lambda t: (0.0, 0.5), PLACES, START, seed=11)
 STRAIGHT = World(lambda t: (0.1, 0.0), PLACES, Pose2(-2.0, 0.5, 0.6), seed=13)
 STAND = World(lambda t: (0.0, 0.0), PLACES, START, seed=14)
@@ -112,6 +113,39 @@ def test_a_mistake_in_a_run_is_said_and_forgotten_once_it_is_mended(name: str) -
     robot.run(20.0)
     assert robot.problems == ()
     assert robot.statuses[-1].learned is None
+
+
+@pytest.mark.parametrize(
+    ("name", "world", "within_s"),
+    [
+        *((f"sightings: {what}", SPIN, 6.0) for what in ("backwards", "from the camera's x")),
+        ("sightings: to the right", SPIN, 6.0),
+        ("odometry: feet", ALL_ROUND, 32.0),
+    ],
+)
+def test_a_mistake_in_a_run_is_said_of_a_robot_that_only_turns_or_sees_all_round(
+    name: str, world: World, within_s: float
+) -> None:
+    robot = DrivenRobot(world)
+    robot.run(20.0)
+    assert robot.problems == ()
+    robot.run(within_s, MISTAKES[name].make())
+    assert is_said(name, MISTAKES[name], robot.problems)
+
+
+@pytest.mark.parametrize(
+    ("name", "seed"),
+    [("odometry: mirrored", 22), ("odometry: mirrored", 23), ("sightings: to the right", 5)],
+)
+def test_a_robot_whose_driver_was_mended_is_not_lost_for_long(name: str, seed: int) -> None:
+    """What it trusted during the mistake must not make its driver look wrong afterwards."""
+    robot = DrivenRobot(SHUTTLE._replace(seed=seed))
+    robot.run(20.0)
+    robot.run(40.0, MISTAKES[name].make())
+    robot.run(45.0)
+    assert robot.problems == ()
+    assert robot.statuses[-1].lost == ""
+    assert robot.is_consistent
 
 
 def test_bearings_of_a_camera_that_looks_elsewhere_are_said_with_their_angle() -> None:

@@ -11,6 +11,7 @@ from statistics import median
 from typing import NamedTuple, TypeVar
 
 from cpcbl_agents.input_diagnosis.implausible_errors import ImplausibleErrors
+from cpcbl_agents.input_diagnosis.jumps import JumpMonitor
 from cpcbl_agents.input_diagnosis.motion_causes import (
     CONTRADICTION,
     OR_START,
@@ -21,10 +22,10 @@ from cpcbl_agents.input_diagnosis.problems import (
     MOTION,
     InputFacts,
     InputWindow,
+    contradicts_mistake,
     implausible_inputs,
     input_problems,
     is_often_refused,
-    jump_problems,
     without_numbers,
 )
 from cpcbl_agents.robot import InputSnapshot
@@ -45,7 +46,7 @@ WINDOW = 10  # judgements, one a second: shares are those of the last so many
 SETTLED_NS = 2_000_000_000  # what was on its way when the robot started is too late
 OFTEN, SELDOM = 20, 10
 """The search for implausible inputs takes some milliseconds. It runs at each of the first `OFTEN`
-judgements and while it finds something, later at every tenth one (`SELDOM`)."""
+judgements, while it finds something and while the robot is lost, else at every tenth one."""
 SECOND_NS, EMPTY_NS = 1_000_000_000, 5_000_000_000
 UNSEEN = 25  # judgements: in real logs a robot saw nothing for 20 s in front of landmarks
 EMPTY_CAME = "empty frames came too before"
@@ -205,11 +206,12 @@ class InputMonitor:
             and settings.sensor.sees_landmarks
         )
         self._starts_known: bool | None = None
+        self._jumps = JumpMonitor(start_ns, settings.odometry.moves)
         self._errors = ImplausibleErrors()
         self._hysteresis, self._implausible = ProblemHysteresis(), tuple[str, ...]()
         self.are_mended = self._are_wrong = False
-        """Whether inputs were implausible or refused before the last judgement, and are right."""
-        self.has_moved = False
+        """Whether inputs were wrong before the last judgement, and are right."""
+        self.has_moved = self.is_mistake_contradicted = False
         """Whether odometry said so, at a judgement."""
         wheels = settings.odometry
         self.inputs["odometry"].scales = wheels.distance_scale, wheels.turn_scale
@@ -249,13 +251,15 @@ class InputMonitor:
         )
         problems = input_problems(facts)
         self._judgements += any(self.inputs[name].messages for name in shown)
-        if self._hysteresis or self._judgements < OFTEN or self._judgements % SELDOM == 0:
+        is_early = self._judgements < OFTEN
+        if self._hysteresis or is_early or snapshot.lost or self._judgements % SELDOM == 0:
             self._implausible = self._find_implausible(snapshot, facts, before, bool(problems))
         are_wrong = bool(self._implausible) or any(map(is_often_refused, facts.windows.values()))
         self.are_mended, self._are_wrong = self._are_wrong and not are_wrong, are_wrong
         health = tuple(self._health(name, totals, before) for name in shown)
         said = (*problems, *self._implausible)
-        return health, said or jump_problems(snapshot.jump, now_ns)
+        jumps = self._jumps.judge(snapshot.jump, self.inputs["odometry"].steps, now_ns)
+        return health, said or jumps
 
     def _find_implausible(
         self, snapshot: InputSnapshot, facts: InputFacts, before: _Totals, has_problems: bool
@@ -281,6 +285,7 @@ class InputMonitor:
             long_steps=_since_stamp(self.inputs["odometry"].steps, long_ns),
             long_frames=[frame for _, frame in _since(seen.spaced, long_ns)],
         )
+        self.is_mistake_contradicted = contradicts_mistake(facts)
         found = implausible_inputs(facts)
         if has_problems and CONTRADICTION in found.get(MOTION, ""):
             del found[MOTION]

@@ -11,14 +11,19 @@ from cpcbl_agents.input_diagnosis import message_causes as causes
 from cpcbl_agents.input_diagnosis import motion_causes as motions
 from cpcbl_agents.input_diagnosis.motion_causes import Step
 from cpcbl_agents.input_diagnosis.position_causes import position_cause
-from cpcbl_agents.input_diagnosis.shift_causes import is_same, is_sure, shift_cause, shift_of
+from cpcbl_agents.input_diagnosis.shift_causes import (
+    contradicts_mistakes,
+    is_same,
+    is_sure,
+    shift_cause,
+    shift_of,
+)
 from cpcbl_agents.input_diagnosis.start_causes import turned_view_cause
 from cpcbl_team import sensor_mistakes as mistakes
 from cpcbl_team.config import Landmark, OdometryNoise, SensorSettings
 from cpcbl_team.errors import nearest_name
 from cpcbl_team.geometry import Pose2
 from cpcbl_team.inputs import Odometry, Position, Sightings
-from cpcbl_team.state import Jump
 from cpcbl_team.trusted_pose import OR_MOVED
 from cpcbl_transport.decoding import decode_by_key, input_problem
 from cpcbl_transport.messages import LARGEST_NUMBER, Frame, SensorInput
@@ -29,7 +34,6 @@ REFUSED_SHARE = 0.05
 LEAST_REFUSED = 3  # a single message may be damaged, or late
 MOST_TOLERANCE = 0.4  # of where a landmark is seen again, as a share of its range
 LATEST_NS = 600_000_000
-JUMP_NS = 15_000_000_000  # for so long a jump of the pose is reported
 WAIT_S = 7.0  # for what landmarks show
 LARGEST_ANGLE = 7.0
 LEAST_COVERED = 0.8  # of the time, by odometry
@@ -77,7 +81,6 @@ STAMPS = {"from_the_future", "too_late", "impossible_duration", "implausible_num
 
 MOTION, OVERLAP, POSITION = "motion", "overlap", "position"  # what implausible inputs are about
 CALIBRATION = "calibration"
-JUMPED = "jumped by"
 
 
 class InputWindow(NamedTuple):
@@ -127,17 +130,6 @@ def input_problems(facts: InputFacts) -> tuple[str, ...]:
 def implausible_inputs(facts: InputFacts) -> dict[str, str]:
     """What no reason refuses, although it cannot be true, by what it is about."""
     return {about: text for about, text in _implausible(facts) if text}
-
-
-def jump_problems(jump: Jump | None, now_ns: int) -> tuple[str, ...]:
-    """What is said of a late jump of the pose, while nothing else says its cause."""
-    if jump is None or now_ns - jump.stamp_ns > JUMP_NS:
-        return ()
-    moved = f"{jump.distance_m:.1f} m and {abs(math.degrees(jump.turn_rad)):.0f}°"
-    return (
-        f"the pose {JUMPED} {moved} without odometry: the robot was carried, its `start` is"
-        " elsewhere, or its odometry or sightings are wrong",
-    )
 
 
 def without_numbers(problem: str) -> str:
@@ -332,15 +324,8 @@ def _motion(
     reported = facts.reported_by_start.get(MOTION)
     if facts.near_start is None and not is_right and reported:
         return reported
-    if facts.near_start is not None and frames:
-        latest = [f for f in frames[-10:] if frames[-1].stamp_ns - f.stamp_ns < LATEST_NS]
-        if cause := motions.view_cause(latest, facts.near_start, marks, tolerance):
-            return f"sightings: {cause}"
-    start = facts.start if facts.is_from_start and not is_right else None
-    if start is not None and (cause := turned_view_cause(frames, steps, start, marks)):
+    if cause := _view_cause(facts, frames, steps, tolerance, is_right):
         return f"sightings: {cause}"
-    if facts.mistake and not is_right:
-        return f"sightings: {facts.mistake}; {OR_MOVED}"
     spans_s = (steps[-1].stamp_ns - steps[0].from_ns) * 1e-9 if steps else math.inf
     if resightings or (
         spans_s < WAIT_S and any(s.id in marks for f in frames for s in f.sightings)
@@ -348,6 +333,37 @@ def _motion(
         return ""  # what landmarks show is known better, or soon
     cause = causes.odometry_cause(pieces)
     return cause and f"odometry: {cause}"
+
+
+def _view_cause(
+    facts: InputFacts,
+    frames: Sequence[Sightings],
+    steps: Sequence[Step],
+    tolerance: float,
+    is_right: bool,
+) -> str:
+    """What is wrong with sightings, by the map and a pose: the start, or that of the filter."""
+    marks = facts.landmarks
+    if facts.near_start is not None and frames:
+        latest = [f for f in frames[-10:] if frames[-1].stamp_ns - f.stamp_ns < LATEST_NS]
+        if cause := motions.view_cause(latest, facts.near_start, marks, tolerance):
+            return cause
+    if is_right:
+        return ""
+    start = facts.start if facts.is_from_start else None
+    if start is not None and (cause := turned_view_cause(frames, steps, start, marks)):
+        return cause
+    is_named = facts.mistake not in ("", mistakes.FIXED)  # what does not turn, motion tells better
+    return f"{facts.mistake}; {OR_MOVED}" if is_named else ""
+
+
+def contradicts_mistake(facts: InputFacts) -> bool:
+    """Whether landmarks move so that no mistake in sightings is left that explains why the robot is
+    lost."""
+    steps = facts.long_steps if facts.mistake and _odometry(facts) else []
+    frames = [_usable(frame) for frame in facts.long_frames]
+    shift = shift_of(frames, steps, facts.landmarks, facts.sensor, facts.wheels)
+    return shift is not None and contradicts_mistakes(shift)
 
 
 def _shift_of_landmarks(

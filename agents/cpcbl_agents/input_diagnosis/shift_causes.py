@@ -27,6 +27,7 @@ from cpcbl_agents.input_diagnosis.motion_causes import (
 from cpcbl_agents.input_diagnosis.start_causes import bearings_off
 from cpcbl_team.config import Landmark, OdometryNoise, SensorSettings
 from cpcbl_team.inputs import Sightings
+from cpcbl_team.sensor_mistakes import FOOT_M
 
 BIN_NS = 500_000_000  # sightings of a landmark within it are one point: their median
 LEAST_SPAN_NS = 3_000_000_000
@@ -34,7 +35,7 @@ LEAST_POINTS = 8
 LEAST_OF_ONE = 4  # of a landmark
 LEAST_SIGMA_M = 0.02  # of where a landmark is seen
 EFFICIENCY = 0.7  # of a median
-SIGMAS = 4.5  # from what a good driver sends, and
+SIGMAS = 4.0  # from what a good driver sends, and
 NEAR_SIGMAS = 3.0  # to what a mistake makes of it
 SCALE_SIGMA, BIAS_SIGMA_RAD = 0.22, math.radians(5.0)  # of a good driver without calibration
 TURN_SIGMA = 0.3
@@ -48,6 +49,7 @@ MOST_TURN_RAD = 0.5  # beyond, the equations do not hold for wrong turns
 GROWING = 0.9  # the share of distances since the start that are larger than the one before
 SMALL = 0.2  # a gain that wheels which slip may have too
 AGREE = 0.1  # how far a mistake's gain may be off, as a share of it
+GOOD_SIGMAS = 2.0
 SURE = 0.15  # sigma of a gain that speaks for a driver
 
 
@@ -126,6 +128,17 @@ def is_sure(shift: Shift) -> bool:
     sigma = max(math.sqrt(variance), shift.turn_sigma)
     is_turn_right = abs(shift.turn_scale - 1.0) < 2.0 * SCALE_SIGMA
     return sigma < SURE and is_turn_right and _sigmas_from_good(shift) < NEAR_SIGMAS
+
+
+def contradicts_mistakes(shift: Shift) -> bool:
+    """Whether the shift is that of a good driver, and not that of bearings that are mirrored or off
+    by a quarter or half of a turn, or of ranges in feet."""
+    is_turn_right = abs(shift.turn_scale - 1.0) < 2.0 * SCALE_SIGMA and shift.turn_sigma < SURE
+    if not is_turn_right or _sigmas_from_good(shift) > GOOD_SIGMAS:
+        return False
+    return all(
+        shift.sigmas_from(gain, AGREE) > NEAR_SIGMAS for gain in (1j, -1j, -1.0, 1.0 / FOOT_M)
+    )
 
 
 def _sigmas_from_good(shift: Shift) -> float:

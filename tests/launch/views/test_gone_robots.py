@@ -51,7 +51,7 @@ def test_a_robot_that_ended_is_gone(end: str) -> None:
     assert (r2.state, r2.problems) == ("waiting", ("sends no status",))
     answers = (EndpointFacts(endpoint="tcp/127.0.0.1:7447", answer="open"),)
     facts = Facts(
-        now=datetime(2026, 1, 1, tzinfo=UTC),
+        now=datetime(2026, 11, 1, tzinfo=UTC),
         python="3.12.0",
         packages={"cpcbl-team": "0.1.0"},
         extras={"camera": True},

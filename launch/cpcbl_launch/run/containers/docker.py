@@ -133,6 +133,11 @@ def check_daemon() -> None:
     """Raises DockerError unless a daemon answers that runs on this machine's kernel."""
     answer = run_command(["docker", "info", "--format", "{{.KernelVersion}}"], timeout_s=20.0)
     if answer.code:
+        if "permission denied" in answer.last_line:
+            raise DockerError(
+                "this user may not use Docker: permission denied at its socket; add the user to the"
+                " group docker, and log in anew"
+            )
         raise DockerError(f"no Docker daemon answers ({answer.last_line}); start it{_on_debian()}")
     kernel, own = answer.last_line, platform.release()
     if kernel != own:

@@ -94,7 +94,10 @@ class RobotInputs:
             return Problem(413, Refusal.TOO_LARGE.value, error)
         publisher = self._publishers[name]
         if not publisher.matching:
-            error = f"robot {self._robot} does not listen: it needs the same team name and router"
+            error = (
+                f"robot {self._robot} does not listen: it does not run, or has another team name or"
+                " router"
+            )
             return Problem(503, "robot_absent", error)
         found = self._payload_problem(name, payload, time.time_ns())
         if found is None or found.reason != "wrong_unit":
