@@ -13,6 +13,7 @@ from typing import Final, NamedTuple
 FADING: Final = 1.0 - 1.0 / 500.0  # of all sums, a frame
 PRIOR_SHARE: Final = 0.05  # sigmas; the two errors look alike, and each takes its part. Wider ones
 PRIOR_BIAS_M: Final = 0.15  # let a robot that stands find large errors that cancel each other
+ALIKE: Final = 0.003  # of one, by what the noise of bearings tells two like errors apart, at most
 MOST_OBJECTS: Final = 6  # of a frame; more tell little more
 CURVED: Final = 0.003  # of a squared distance: a larger variance across it bends its linear form
 LEAST_PAIRS: Final = 20.0
@@ -73,7 +74,13 @@ class Fit(NamedTuple):
         return 2.0 * (self.s * share + self.b * bias) - squared
 
     def errors(self) -> RangeErrors:
-        """Those that explain most."""
+        """Those that explain most. Where both look alike, as to a robot that stands, the noise of
+        the readings must not tell them apart: each takes its part of the one known number."""
+        if self.ss * self.bb - self.sb**2 < ALIKE * self.ss * self.bb:
+            slope = self.sb / self.ss
+            known = 1.0 + PRIOR_SHARE**2 * self.ss + PRIOR_BIAS_M**2 * self.bb
+            part = self.s / known
+            return RangeErrors(PRIOR_SHARE**2 * part, PRIOR_BIAS_M**2 * slope * part)
         ss, bb = self.ss + PRIOR_SHARE**-2, self.bb + PRIOR_BIAS_M**-2
         k = 1.0 / (ss * bb - self.sb**2)
         share, bias_m = bb * self.s - self.sb * self.b, ss * self.b - self.sb * self.s
