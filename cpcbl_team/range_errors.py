@@ -7,7 +7,8 @@ misled by a wrong one. One landmark tells nothing, for odometry may be wrong as 
 What a bias of ranges makes of a distance depends on the angle between both landmarks. It is taken
 from the frames before: where it has the noise of the same bearings as the distance itself, both
 errors grow without limit while they cancel each other (errors in variables: W. A. Fuller,
-Measurement Error Models, 1987; the earlier frame is the instrument).
+Measurement Error Models, 1987; the earlier frame is the instrument). So is whether a distance is
+linear enough to be used: chosen by their own noise, distances would be too short.
 """
 
 import math
@@ -18,7 +19,7 @@ from typing import Final, NamedTuple
 FADING: Final = 1.0 - 1.0 / 500.0  # of all sums, a frame
 PRIOR_SHARE: Final = 0.05  # sigmas; the two errors look alike, and each takes its part. Wider ones
 PRIOR_BIAS_M: Final = 0.15  # let a robot that stands find large errors that cancel each other
-LAST_SHARE: Final = 0.2  # of the last frame in what a bias makes of a distance
+LAST_SHARE: Final = 0.2  # of the last frame in what is known of a pair before the next one
 MOST_OBJECTS: Final = 6  # of a frame; more tell little more
 CURVED: Final = 0.003  # of a squared distance: a larger variance across it bends its linear form
 LEAST_PAIRS: Final = 20.0
@@ -86,8 +87,19 @@ class Fit(NamedTuple):
         return RangeErrors(k * share, k * bias_m)
 
 
+class PairGeometry(NamedTuple):
+    """How a pair of landmarks was seen lately: fading means."""
+
+    per_bias: float  # what a bias of one metre makes of the distance
+    across: float  # the variance (m^2) of both landmarks across the line between them
+
+    def plus(self, last: "PairGeometry") -> "PairGeometry":
+        pairs = zip(self, last, strict=True)
+        return PairGeometry(*(mean + LAST_SHARE * (new - mean) for mean, new in pairs))
+
+
 _NONE: Final[Mapping[str, Fit]] = {}
-_NO_PAIRS: Final[Mapping[tuple[str, str], float]] = {}
+_NO_PAIRS: Final[Mapping[tuple[str, str], PairGeometry]] = {}
 
 
 class RangeEvidence(NamedTuple):
@@ -97,8 +109,8 @@ class RangeEvidence(NamedTuple):
     squares: float = 0.0
     pairs: float = 0.0  # as many as have no landmark in common
     of_object: Mapping[str, Fit] = _NONE  # of the pairs in which an object is
-    per_bias: Mapping[tuple[str, str], float] = _NO_PAIRS
-    """What a bias of one makes of the distance of each pair in the last frame: a fading mean."""
+    geometry: Mapping[tuple[str, str], PairGeometry] = _NO_PAIRS
+    """Of the pairs of the last frame."""
 
     def plus(self, frame: Sequence[Seen]) -> "RangeEvidence":
         """With the distances between the landmarks of one frame."""
@@ -113,23 +125,23 @@ class RangeEvidence(NamedTuple):
             FADING * self.squares,
             FADING * self.pairs,
         )
-        per_bias = {}
+        geometry = {}
         for one, other in combinations(sorted(frame), 2):
             found = _distance_error(one, other)
             if found is None:
                 continue
-            error, s, b_now, variance = found
+            error, s, variance, last = found
             pair = one.name, other.name
-            b = self.per_bias.get(pair)
-            per_bias[pair] = b_now if b is None else b + LAST_SHARE * (b_now - b)
-            if b is None:
+            before = self.geometry.get(pair)
+            geometry[pair] = last if before is None else before.plus(last)
+            if before is None or before.across > CURVED * s * s:
                 continue
-            w = weight / variance
+            w, b = weight / variance, before.per_bias
             of_pair = Fit(w * s * s, w * s * b, w * b * b, w * s * error, w * b * error)
             fit, squares, pairs = fit.plus(of_pair), squares + w * error**2, pairs + weight
             for name in (one.name, other.name):
                 of_object[name] = of_object.get(name, nothing).plus(of_pair)
-        return RangeEvidence(fit, squares, pairs, of_object, per_bias)
+        return RangeEvidence(fit, squares, pairs, of_object, geometry)
 
     def errors(self, present: RangeErrors, independent_share: float) -> RangeErrors:
         """The errors of ranges: none until some are clear, then the best estimate. This share of
@@ -160,9 +172,9 @@ class RangeEvidence(NamedTuple):
         return max(abs(share + bias_m / (k * usual_m)) for k in (0.5, 1.5))
 
 
-def _distance_error(one: Seen, other: Seen) -> tuple[float, float, float, float] | None:
-    """By how much the distance between two landmarks is read too short (m), what a share of one and
-    a bias of one metre make of it, and its variance (m^2); None if that cannot be linearized."""
+def _distance_error(one: Seen, other: Seen) -> tuple[float, float, float, PairGeometry] | None:
+    """By how much the distance between two landmarks is read too short (m), what a share of one
+    makes of it, its variance (m^2), and how the pair was seen; None if nothing can be said."""
     distance = math.hypot(other.x - one.x, other.y - one.y)
     ax, ay = _point(one)
     bx, by = _point(other)
@@ -179,9 +191,10 @@ def _distance_error(one: Seen, other: Seen) -> tuple[float, float, float, float]
         variance += c * of_range + s * of_bearing
         across += s * of_range + c * of_bearing
         per_bias += sign * towards
-    if across > CURVED * distance * distance or variance == 0.0:
+    if distance == 0.0 or variance == 0.0:
         return None
-    return distance - (read - 0.5 * across / distance), distance, per_bias, variance
+    error = distance - (read - 0.5 * across / distance)
+    return error, distance, variance, PairGeometry(per_bias, across)
 
 
 def _point(seen: Seen) -> tuple[float, float]:

@@ -91,6 +91,29 @@ def test_a_robot_that_stands_finds_no_large_errors_that_cancel_each_other(
         assert abs(bias_m) < 0.05
 
 
+@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize(("share", "bearing_deg"), [(0.005, 0.5), (0.02, 2.0), (0.05, 3.0)])
+@pytest.mark.parametrize("x_m", [4.5, 3.0])
+def test_a_robot_that_stands_before_two_landmarks_finds_no_errors_that_cancel(
+    x_m: float, share: float, bearing_deg: float, seed: int
+) -> None:
+    """As the observer of the demonstration. The noise of the bearings seems to tell a scale from a
+    bias there; they cancel at the landmarks, and together are wrong by 0.3 m at teammates."""
+    rng, found, errors = np.random.default_rng(seed), RangeEvidence(), NO_RANGE_ERRORS
+    sigma = math.radians(bearing_deg)
+    for n in range(2_000):
+        seen = []
+        for name, x in (("southwest", 0.0), ("southeast", 9.0)):
+            range_m, bearing = math.hypot(x - x_m, 5.0), math.atan2(x - x_m, 5.0)
+            sigma_m = share * range_m
+            read = range_m + sigma_m * rng.normal(), bearing + sigma * rng.normal()
+            seen.append(Seen(name, x, 0.0, *read, sigma_m, sigma))
+        found = found.plus(seen)
+        if n % 20 == 0:
+            errors = found.errors(errors, 1.0)
+    assert errors == NO_RANGE_ERRORS
+
+
 def test_a_landmark_that_stands_elsewhere_is_no_error_of_ranges() -> None:
     for seed in range(4):
         found = evidence(NO_RANGE_ERRORS, seed, moved="ne")
