@@ -7,40 +7,20 @@ the table of scenarios names it by its key in `ABUSES`.
 import random
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import NamedTuple
 
 from cpcbl_agents.stop import StopSignal
 from cpcbl_launch.lab.chaos import router_abuses
+from cpcbl_launch.lab.chaos.abuser import Abuser
 from cpcbl_launch.team.file import load_team
-from cpcbl_team.config import Team
 from cpcbl_team.inputs import Belief, Fix
 from cpcbl_transport import topics
 from cpcbl_transport.compact import encode_help
-from cpcbl_transport.security import Identity, link_of
-from cpcbl_transport.topics import Role
-from cpcbl_transport.zenoh_bus import ZenohBus, open_bus
 
 FLOOD_RATE_HZ = 2500.0
 GARBAGE_EVERY_S = 0.02
 UNSURE = (25.0, 0.0, 25.0, 0.0, 0.0, 1.0)
-
-
-class Abuser(NamedTuple):
-    """The member that abuses its team."""
-
-    team: Team
-    robot: str
-    endpoint: str
-    targets: Sequence[str]  # the other robots
-    stop: Callable[[], bool]
-
-    def session(self) -> ZenohBus:
-        """A new session of the member: of a robot of the file, or else of an observer."""
-        role = Role.ROBOT if self.robot in self.team.robots else Role.OBSERVER
-        link = link_of(self.team, Identity(role, self.robot), [self.endpoint])
-        return open_bus(self.team.name, link.endpoints, self.stop, link.credentials)
 
 
 def flood(abuser: Abuser) -> int:

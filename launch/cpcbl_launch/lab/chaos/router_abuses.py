@@ -12,14 +12,11 @@ import sys
 import threading
 import time
 from contextlib import ExitStack, suppress
-from typing import TYPE_CHECKING
 
+from cpcbl_launch.lab.chaos.abuser import Abuser
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Handle
 from cpcbl_transport.topics import Qos
-
-if TYPE_CHECKING:
-    from cpcbl_launch.lab.chaos.abuses import Abuser
 
 BIG, LARGE = 60_000, 100_000_000  # bytes of a payload; 1 MB is allowed at most
 SENDERS, SENDS_HZ = 2, 500.0
@@ -32,7 +29,7 @@ HALF_OPEN, HALF_OPEN_EVERY_S = 600, 0.02
 LARGE_EVERY_S = 1.0
 
 
-def deaf(abuser: "Abuser") -> int:
+def deaf(abuser: Abuser) -> int:
     """A session subscribes to its own input and stops reading; two others send it large payloads,
     which wait for their place in the queue. Again and again."""
     command = [sys.executable, "-m", "cpcbl_launch.lab.chaos.abuses", "listen", *sys.argv[2:4]]
@@ -48,7 +45,7 @@ def deaf(abuser: "Abuser") -> int:
         return sum(sender.sent() for sender in senders)
 
 
-def listen(abuser: "Abuser") -> int:
+def listen(abuser: Abuser) -> int:
     """Subscribes to its own odometry."""
     with abuser.session() as bus:
         bus.subscribe(topics.IN_ODOMETRY.at(robot=abuser.robot), lambda key, payload: None)
@@ -60,7 +57,7 @@ def listen(abuser: "Abuser") -> int:
 class Sender:
     """Sends large payloads to the abuser's own input until it stops."""
 
-    def __init__(self, abuser: "Abuser") -> None:
+    def __init__(self, abuser: Abuser) -> None:
         self._abuser, self._sent = abuser, 0
         self._thread = threading.Thread(target=self._send, daemon=True)
         self._thread.start()
@@ -80,7 +77,7 @@ class Sender:
         return self._sent
 
 
-def tokens(abuser: "Abuser") -> int:
+def tokens(abuser: Abuser) -> int:
     """Declares and takes back liveliness tokens of its own name, some thousands a second."""
     sent, begin_s = 0, time.monotonic()
     with ExitStack() as stack:
@@ -94,7 +91,7 @@ def tokens(abuser: "Abuser") -> int:
     return sent
 
 
-def subscriptions(abuser: "Abuser") -> int:
+def subscriptions(abuser: Abuser) -> int:
     """Subscribes to thousands of keys, and closes its session. Again and again."""
     sent = 0
     while not abuser.stop():
@@ -110,7 +107,7 @@ def subscriptions(abuser: "Abuser") -> int:
     return sent
 
 
-def sessions(abuser: "Abuser") -> int:
+def sessions(abuser: Abuser) -> int:
     """Opens as many sessions as the router takes, and keeps them open."""
     with ExitStack() as stack:
         opened, begin_s = 0, time.monotonic()
@@ -125,7 +122,7 @@ def sessions(abuser: "Abuser") -> int:
         os._exit(0)  # the sessions end with the process, at once
 
 
-def half_open(abuser: "Abuser") -> int:
+def half_open(abuser: Abuser) -> int:
     """Opens hundreds of connections over which it sends nothing, and opens again what is closed.
     It needs no keys."""
     host, _, port = abuser.endpoint.partition("/")[2].rpartition(":")
@@ -157,7 +154,7 @@ def _is_closed(connection: socket.socket) -> bool:
     return True
 
 
-def large(abuser: "Abuser") -> int:
+def large(abuser: Abuser) -> int:
     """Sends payloads a hundred times as large as any that is allowed."""
     sent = 0
     with abuser.session() as bus:
