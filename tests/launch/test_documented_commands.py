@@ -118,6 +118,7 @@ WAYS = {
     "cpcbl-team experiment figure7-cameras": Way(
         EXPERIMENT, "long", "--seeds 1", shows=FIGURE_7[1:]
     ),
+    "cpcbl-team experiment liars": Way(EXPERIMENT, "long", "--seeds 1"),
     "cpcbl-team experiment liars --seeds 4": Way(
         EXPERIMENT, "long", "--seeds 1", shows=("one liar, 2 honest",)
     ),
