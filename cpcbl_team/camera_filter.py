@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 from msgspec.structs import replace
 
-from cpcbl_team.camera_errors import NO_ERRORS, without_errors
+from cpcbl_team.camera_errors import NO_ERRORS
 from cpcbl_team.common_errors import (
     CommonErrors,
     Pair,
@@ -60,7 +60,7 @@ class CameraFilter:
         """The sighting without the errors that are known."""
         common = state.common_errors
         assert common is not None
-        return without_errors(sighting, common.errors, common.axis_rad)
+        return common.corrected(sighting)
 
     def as_evidence(self, state: State, m: Measurement) -> Measurement:
         """The measurement with sigmas that include the common errors: for what has no place for

@@ -11,7 +11,12 @@ import math
 from collections.abc import Callable, Iterable
 from typing import Final, NamedTuple
 
-from cpcbl_team.camera_errors import CameraErrors, bearing_sensitivity, range_sensitivity
+from cpcbl_team.camera_errors import (
+    CameraErrors,
+    bearing_sensitivity,
+    range_sensitivity,
+    without_errors,
+)
 from cpcbl_team.estimate import (
     POSE,
     ZERO3,
@@ -24,6 +29,7 @@ from cpcbl_team.estimate import (
 from cpcbl_team.fusion import Observation, best_weight
 from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.geometry import new
+from cpcbl_team.inputs import Sighting
 from cpcbl_team.motion import motion_jacobian
 
 Pair = tuple[float, float]
@@ -49,6 +55,10 @@ class CommonErrors(NamedTuple):
         """Whether they are known well enough not to matter beside other errors."""
         yaw, _, focal = self.covariance
         return yaw < PRECISE.xx and focal < PRECISE.yy
+
+    def corrected(self, sighting: Sighting) -> Sighting:
+        """The sighting without the errors that are known."""
+        return without_errors(sighting, self.errors, self.axis_rad)
 
     def uncorrelated(self) -> "CommonErrors":
         """For a robot that has found its pose anew."""

@@ -38,6 +38,7 @@ these decide, to be used."""
 HEADING_VARIANCE: Final = math.radians(5.0) ** 2
 """rad^2: the heading of an estimate that was led astray may be wrong by more than its variance."""
 NOTHING: Final = Covariance2(0.0, 0.0, 0.0)
+Offset = tuple[float, float]
 
 
 class MeanOffset(NamedTuple):
@@ -61,6 +62,16 @@ class MeanOffset(NamedTuple):
     def is_precise(self) -> bool:
         """Whether it is certain enough for a vote."""
         return self.is_within(MOST_SIGMA_M)
+
+
+def about_position(evidence: Sums, heading_variance: float) -> tuple[Covariance2, Offset]:
+    """What evidence of the offset of the estimate says of its position: matrix and vector. The
+    heading is marginalized (the Schur complement); `heading_variance` (rad^2): that of the
+    estimate, for what a bearing says of the position depends on the heading."""
+    (xx, xy, yy, xh, yh, hh), (x, y, h) = evidence
+    k = 1.0 / (hh + 1.0 / (heading_variance + HEADING_VARIANCE))
+    matrix = Covariance2(xx - k * xh * xh, xy - k * xh * yh, yy - k * yh * yh)
+    return matrix, (x - k * xh * h, y - k * yh * h)
 
 
 class FadingOffsets(NamedTuple):
@@ -98,14 +109,10 @@ class FadingOffsets(NamedTuple):
 
     def mean(self, heading_variance: float, common_m: float = FAST_COMMON_M) -> MeanOffset | None:
         """The mean of the reports, if they are enough to determine one. `heading_variance` (rad^2):
-        that of the estimate; what a bearing says of the position depends on the heading."""
+        that of the estimate."""
         if self.reports < LEAST_REPORTS:
             return None
-        (xx, xy, yy, xh, yh, hh), (x, y, h) = self.evidence
-        # The heading is marginalized: the Schur complement.
-        k = 1.0 / (hh + 1.0 / (heading_variance + HEADING_VARIANCE))
-        xx, xy, yy = xx - k * xh * xh, xy - k * xh * yh, yy - k * yh * yh
-        x, y = x - k * xh * h, y - k * yh * h
+        (xx, xy, yy), (x, y) = about_position(self.evidence, heading_variance)
         determinant = xx * yy - xy * xy
         if determinant <= 1e-9 * xx * yy or xx <= 0.0 or yy <= 0.0:
             return None

@@ -307,9 +307,10 @@ def with_recovery(state: State, recovery: RecoveryMemory) -> State:
 
 def with_common_errors(state: State, common: CommonErrors) -> State:
     """The state that knows this of the constant errors of the camera."""
-    recovery, teammates, calibration, events = state.memory
-    calibration = new(CalibrationMemory, (*calibration[:7], common))
-    return with_memory(state, new(Memory, (recovery, teammates, calibration, events)))
+    memory = state.memory
+    return with_memory(
+        state, memory._replace(calibration=memory.calibration._replace(common=common))
+    )
 
 
 def with_records(

@@ -11,13 +11,13 @@ from msgspec.structs import replace
 
 from cpcbl_team import trust
 from cpcbl_team.config import LocalizationSettings
-from cpcbl_team.estimate import Covariance3, Information
+from cpcbl_team.estimate import Covariance3, Information, Sums
 from cpcbl_team.fixes import PoseObservation
 from cpcbl_team.fusion import Observation
 from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.inputs import Belief, Input, Position, Sightings
 from cpcbl_team.landmarks import LandmarkUpdate
-from cpcbl_team.mean_offsets import HEADING_VARIANCE
+from cpcbl_team.mean_offsets import HEADING_VARIANCE, about_position
 from cpcbl_team.measurements import (
     GatedObject,
     GatedObjects,
@@ -245,10 +245,8 @@ def _own_offset(state: State, sums: Information, accepted: Iterable[GatedObject]
         ax * ay * yy + (ax * by + ay * bx) * yf + bx * by * ff,
         ay * ay * yy + 2.0 * ay * by * yf + by * by * ff,
     )
-    position = _without_heading(sums, turn)
-    alone = tuple(INDEPENDENT_FRAMES * v for v in position.vector)
-    position = Information(position.matrix.scaled(INDEPENDENT_FRAMES), (alone[0], alone[1], 0.0))
-    return OffsetEvidence(position, dependent, variance)
+    position = _without_heading(sums, variance)
+    return OffsetEvidence(position, dependent, variance).weighted(INDEPENDENT_FRAMES)
 
 
 def _with_camera(state: State, m: Measurement, evidence: OffsetEvidence) -> OffsetEvidence:
@@ -260,18 +258,14 @@ def _with_camera(state: State, m: Measurement, evidence: OffsetEvidence) -> Offs
     (x, y, covariance), (yy, _, ff), pose = m.position, common.covariance, state.estimate.pose
     squared = (x - pose.x) ** 2 + (y - pose.y) ** 2
     variance = 0.5 * (covariance.xx + covariance.yy + squared * (yy + ff))
-    turn = 1.0 / (evidence.heading_variance + HEADING_VARIANCE)
-    sums = _without_heading(Information.of(evidence.evidence), turn)
+    sums = _without_heading(evidence.evidence, evidence.heading_variance)
     return evidence._replace(evidence=sums, dependent=Covariance2(variance, 0.0, variance))
 
 
-def _without_heading(sums: Information, prior: float) -> Information:
-    """What a frame says of the position alone (the Schur complement). `prior`: the information
-    (1/rad^2) about the heading, whose error is not the same in all frames."""
-    (xx, xy, yy, xh, yh, hh), (x, y, h) = sums
-    k = 1.0 / (hh + prior)
-    matrix = Covariance3(xx - k * xh * xh, xy - k * xh * yh, yy - k * yh * yh, 0.0, 0.0, 0.0)
-    return Information(matrix, (x - k * xh * h, y - k * yh * h, 0.0))
+def _without_heading(sums: Sums, heading_variance: float) -> Information:
+    """What a frame says of the position alone: the error of the heading is not the same in all."""
+    (xx, xy, yy), (x, y) = about_position(sums, heading_variance)
+    return Information(Covariance3(xx, xy, yy, 0.0, 0.0, 0.0), (x, y, 0.0))
 
 
 def _bounded(senders: SenderRecords) -> SenderRecords:

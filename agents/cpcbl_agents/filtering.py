@@ -4,7 +4,6 @@ from collections import Counter, deque
 from collections.abc import Sequence
 
 from cpcbl_agents.agent import AgentMessage, FrameEstimate, PoseEstimate, Presence, Tick
-from cpcbl_team.camera_errors import without_errors
 from cpcbl_team.config import CameraSettings, Field, LocalizationSettings
 from cpcbl_team.inputs import (
     Belief,
@@ -141,9 +140,7 @@ class FilterAgent:
             frame = recalibrated(frame, calibration.bearing_bias_rad, scale)
             common = state.common_errors
             if common is not None:
-                corrected = (
-                    without_errors(s, common.errors, common.axis_rad) for s in frame.sightings
-                )
-                frame = Sightings(frame.stamp_ns, tuple(corrected))
+                corrected = tuple(map(common.corrected, frame.sightings))
+                frame = Sightings(frame.stamp_ns, corrected)
             ready.append(FrameEstimate(frame, state.reported, state.lost, factor, common))
         return ready

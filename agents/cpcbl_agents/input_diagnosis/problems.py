@@ -360,9 +360,10 @@ def _view_cause(
 def contradicts_mistake(facts: InputFacts) -> bool:
     """Whether landmarks move so that no mistake in sightings is left that explains why the robot is
     lost."""
-    steps = facts.long_steps if facts.mistake and _odometry(facts) else []
+    if not facts.mistake or not _odometry(facts):
+        return False
     frames = [_usable(frame) for frame in facts.long_frames]
-    shift = shift_of(frames, steps, facts.landmarks, facts.sensor, facts.wheels)
+    shift = shift_of(frames, facts.long_steps, facts.landmarks, facts.sensor, facts.wheels)
     return shift is not None and contradicts_mistakes(shift)
 
 
