@@ -126,6 +126,27 @@ def sharpest(variance: float) -> float:
     return variance if variance > SHARPEST_VARIANCE else SHARPEST_VARIANCE
 
 
+class FilteredOffset(NamedTuple):
+    """The offset from a pose by a Kalman filter of scalar measurements, all linearized there."""
+
+    covariance: Covariance3
+    offset: Row = (0.0, 0.0, 0.0)
+    cost: float = 0.0  # the chi-square of the innovations
+
+    def after(self, measurements: Iterable[tuple[Row, float, float]]) -> "FilteredOffset":
+        """After more measurements: row, residual and variance of each."""
+        covariance, (x, y, heading), cost = self
+        for row, residual, variance in measurements:
+            px, py, ph = covariance.times(row)
+            k = 1.0 / (row[0] * px + row[1] * py + row[2] * ph + variance)
+            off = residual - row[0] * x - row[1] * y - row[2] * heading
+            cost += k * off * off
+            x, y, heading = x + k * off * px, y + k * off * py, heading + k * off * ph
+            gained = Covariance3(px * px, px * py, py * py, px * ph, py * ph, ph * ph)
+            covariance = covariance.plus(gained, -k)
+        return FilteredOffset(covariance, (x, y, heading), cost)
+
+
 class InformationSum:
     """Adds up evidence about the offset from a prior (step 4)."""
 

@@ -14,13 +14,16 @@ from typing import NamedTuple
 from cpcbl_team.config import Field, OdometryNoise
 from cpcbl_team.constraints import Constraint, bearing_heading, range_circle
 from cpcbl_team.estimate import (
+    POSE,
     SMALLEST_VARIANCE,
     ZERO3,
     Covariance3,
     Estimate,
+    FilteredOffset,
     InformationSum,
     Row,
     merge,
+    offset_pose,
 )
 from cpcbl_team.geometry import Pose2, wrap_angle
 from cpcbl_team.motion import motion_noise
@@ -84,6 +87,12 @@ def relocalize(
     return Estimate(estimate.pose, covariance, covariance if repeated else ZERO3)
 
 
+def drift_sigmas(moved: Pose2) -> tuple[float, float]:
+    """How far dead reckoning over such a motion errs, while a pose is looked for (m, rad)."""
+    way, turn = math.hypot(moved.x, moved.y), abs(moved.heading)
+    return DRIFT_SHARE * (way + 0.3 * turn), DRIFT_SHARE * (turn + 0.3 * way)
+
+
 def readings_of(e: Evidence) -> int:
     """How many numbers a piece of evidence says: a position is two."""
     if e.range_m is None and e.bearing_rad is None:
@@ -98,9 +107,7 @@ class PropagatedEvidence:
         """`repeated`: how many pieces may have the same error of a teammate."""
         self.evidence = evidence
         self.now_from_then = odometry_from_robot.inverse() @ evidence.odometry_from_robot
-        way = math.hypot(self.now_from_then.x, self.now_from_then.y)
-        drift_m = DRIFT_SHARE * (way + 0.3 * abs(self.now_from_then.heading))
-        drift_rad = DRIFT_SHARE * (abs(self.now_from_then.heading) + 0.3 * way)
+        drift_m, drift_rad = drift_sigmas(self.now_from_then)
         self.is_fix = evidence.range_m is None and evidence.bearing_rad is None
         factor = math.sqrt(repeated) if evidence.from_teammate else 1.0
         self._teammate_m = factor * evidence.teammate_sigma_m
@@ -277,42 +284,30 @@ def _with_drift(fit: Fit, noise: OdometryNoise) -> tuple[float, Estimate]:
     around its path, and around the better one."""
     pose = fit.pose
     for _ in range(2):
-        cost, offset, covariance = _filtered(pose, fit.used, noise)
-        pose = _at_offset(pose, offset)
+        covariance, offset, cost = _filtered(pose, fit.used, noise)
+        pose = offset_pose(pose, offset, POSE)
     return cost, Estimate(pose, covariance)
 
 
-def _filtered(
-    pose: Pose2, used: list[PropagatedEvidence], noise: OdometryNoise
-) -> tuple[float, Row, Covariance3]:
+def _filtered(pose: Pose2, used: list[PropagatedEvidence], noise: OdometryNoise) -> FilteredOffset:
     """The least chi-square, its offset from `pose` and the offset's covariance, by a Kalman filter
     from the oldest piece to the present. It is linear around the path that ends at `pose`."""
-    cost, (x, y, heading), covariance = 0.0, (0.0, 0.0, 0.0), _OPEN
+    state = FilteredOffset(_OPEN)
     last = None
     for piece in (*used, None):
         then = pose if piece is None else pose @ piece.now_from_then
         if last is not None:
+            covariance, (x, y, heading), cost = state
             dx, dy, turn = then.x - last.x, then.y - last.y, then.heading - last.heading
-            x, y = x - dy * heading, y + dx * heading
+            offset = x - dy * heading, y + dx * heading, heading
             covariance = covariance.transformed((1.0, 0.0, -dy, 0.0, 1.0, dx, 0.0, 0.0, 1.0))
             way = math.hypot(dx, dy)
             drift = motion_noise(last.heading, way, wrap_angle(turn), noise)
-            covariance = covariance.plus(drift, DRIFT_FACTOR)
+            state = FilteredOffset(covariance.plus(drift, DRIFT_FACTOR), offset, cost)
         last = then
-        for row, residual, variance in () if piece is None else piece.rows_without_drift(then):
-            px, py, ph = covariance.times(row)
-            k = 1.0 / (row[0] * px + row[1] * py + row[2] * ph + variance)
-            off = residual - row[0] * x - row[1] * y - row[2] * heading
-            cost += k * off * off
-            x, y, heading = x + k * off * px, y + k * off * py, heading + k * off * ph
-            gained = px * px, px * py, py * py, px * ph, py * ph, ph * ph
-            covariance = covariance.plus(Covariance3(*gained), -k)
-    return cost, (x, y, heading), covariance
-
-
-def _at_offset(pose: Pose2, offset: Row) -> Pose2:
-    x, y, heading = offset
-    return Pose2(pose.x + x, pose.y + y, wrap_angle(pose.heading + heading))
+        if piece is not None:
+            state = state.after(piece.rows_without_drift(then))
+    return state
 
 
 def _wider_covariance(
@@ -350,7 +345,7 @@ def _profile(
     """(chi-square, offset) of the best pose among those that are so far along an axis."""
     offset, least = _sum((0.0, 0.0, 0.0), axis, goal), math.nan
     for _ in range(3):
-        least, step, covariance = _filtered(_at_offset(origin, offset), used, noise)
+        covariance, step, least = _filtered(offset_pose(origin, offset, POSE), used, noise)
         towards = covariance.times(axis)
         along = _dot(axis, towards)
         if along <= 0.0:

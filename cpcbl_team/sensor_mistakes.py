@@ -6,12 +6,13 @@ rejections, brought to the present by odometry, tells the two apart: if the evid
 mistake is undone, nothing may move the robot.
 """
 
+import cmath
 import math
 from collections.abc import Callable, Sequence
 from typing import Final, NamedTuple
 
-from cpcbl_team.estimate import Covariance3, Estimate
-from cpcbl_team.geometry import Pose2, wrap_angle
+from cpcbl_team.estimate import POSE, Estimate, FilteredOffset, offset_pose
+from cpcbl_team.geometry import Pose2
 from cpcbl_team.relocalization import (
     OUTLIER,
     PropagatedEvidence,
@@ -30,12 +31,17 @@ MOST_WAY_M: Final = 2.0  # and beyond this
 FOOT_M: Final = 0.3048
 
 
+View = Callable[[complex, float], complex]
+"""Where an object is in the robot's frame (x + i y), by where it seems to be and by the heading."""
+
+
 class SensorMistake(NamedTuple):
     """What a driver may have done to sightings, and what undoes it."""
 
     text: str
-    bearing: Callable[[float, float], float]  # of the bearing as it came, and of the heading then
-    range_scale: float = 1.0
+    view: View
+    group: str = ""
+    """What is said where mistakes that look alike cannot be told apart; empty: the text."""
 
 
 MIRRORED: Final = "bearings look mirrored; left is positive"
@@ -47,13 +53,21 @@ FIXED: Final = (
 )
 IN_FEET: Final = "ranges look like feet"
 MISTAKES: Final = (
-    SensorMistake(MIRRORED, lambda b, h: -b),
-    SensorMistake(QUARTER_OFF, lambda b, h: b + 0.5 * math.pi),
-    SensorMistake(QUARTER_OFF, lambda b, h: b - 0.5 * math.pi),
-    SensorMistake(HALF_OFF, lambda b, h: b + math.pi),
-    SensorMistake(FIXED, lambda b, h: b - h),
-    SensorMistake(FIXED, lambda b, h: 0.5 * math.pi - b - h),
-    SensorMistake(IN_FEET, lambda b, h: b, FOOT_M),
+    SensorMistake(MIRRORED, lambda p, h: p.conjugate()),
+    SensorMistake(QUARTER_OFF, lambda p, h: p * 1j),
+    SensorMistake(QUARTER_OFF, lambda p, h: p / 1j),
+    SensorMistake(HALF_OFF, lambda p, h: -p),
+    SensorMistake(
+        "bearings count from x of the field, not from ahead",
+        lambda p, h: p * cmath.rect(1.0, -h),
+        FIXED,
+    ),
+    SensorMistake(
+        "bearings count from north, not from ahead",
+        lambda p, h: 1j * p.conjugate() * cmath.rect(1.0, -h),
+        FIXED,
+    ),
+    SensorMistake(IN_FEET, lambda p, h: p * FOOT_M),
 )
 
 
@@ -83,7 +97,7 @@ def mistake_in_evidence(
             corrected = [_without(mistake, e, known.pose, odometry_from_robot) for e in own]
             fit = _misfit(known, corrected, odometry_from_robot, noise_factor)
             if fit is not None and fit[0] < least:
-                least, best = fit[0], ExplainingMistake(mistake.text, fit[1])
+                least, best = fit[0], ExplainingMistake(mistake.group or mistake.text, fit[1])
         if best is not None:
             return best
     return None
@@ -100,10 +114,13 @@ def _is_usable(e: Evidence, place: Pose2) -> bool:
 def _without(mistake: SensorMistake, e: Evidence, now: Pose2, place: Pose2) -> Evidence:
     """The piece of evidence with the mistake undone, for a robot at the pose `now`."""
     then = now @ (place.inverse() @ e.odometry_from_robot)
-    bearing = wrap_angle(mistake.bearing(e.bearing_rad or 0.0, then.heading))
-    scale = mistake.range_scale
+    seen = cmath.rect(e.range_m or 1.0, e.bearing_rad or 0.0)
+    real = mistake.view(seen, then.heading)
+    scale = abs(real) / abs(seen)
     range_m = None if e.range_m is None else scale * e.range_m
-    return e._replace(range_m=range_m, bearing_rad=bearing, range_sigma_m=scale * e.range_sigma_m)
+    return e._replace(
+        range_m=range_m, bearing_rad=cmath.phase(real), range_sigma_m=scale * e.range_sigma_m
+    )
 
 
 def _misfit(
@@ -112,31 +129,14 @@ def _misfit(
     """The chi-square of the evidence by a Kalman filter that begins at the known pose, and the pose
     then; None if it is beyond the bound, or if too many pieces do not fit at all. `noise_factor`:
     on the sigmas of the evidence."""
-    estimate, cost, used, readings = known, 0.0, 0, 0
+    pose, state, used, readings = known.pose, FilteredOffset(known.covariance), 0, 0
     for piece in [PropagatedEvidence(e, place, 0) for e in evidence]:
-        updated, of_piece = _updated(estimate, piece, noise_factor)
-        if of_piece < OUTLIER:
-            estimate, cost = updated, cost + of_piece
+        rows = [(row, off, v * noise_factor * noise_factor) for row, off, v in piece.rows(pose)]
+        after = FilteredOffset(state.covariance).after(rows)
+        if after.cost < OUTLIER:
+            pose = offset_pose(pose, after.offset, POSE)
+            state = after._replace(cost=state.cost + after.cost)
             used, readings = used + 1, readings + readings_of(piece.evidence)
-    if used < LEAST_SHARE * len(evidence) or cost > chi_square_bound(readings):
+    if used < LEAST_SHARE * len(evidence) or state.cost > chi_square_bound(readings):
         return None
-    return cost + OUTLIER * (len(evidence) - used), estimate.pose
-
-
-def _updated(
-    estimate: Estimate, piece: PropagatedEvidence, noise_factor: float
-) -> tuple[Estimate, float]:
-    """The estimate after a piece of evidence, and the chi-square of its innovations."""
-    cost, (x, y, h), covariance = 0.0, (0.0, 0.0, 0.0), estimate.covariance
-    for row, residual, variance in piece.rows(estimate.pose):
-        px, py, ph = covariance.times(row)
-        variance *= noise_factor * noise_factor
-        k = 1.0 / (row[0] * px + row[1] * py + row[2] * ph + variance)
-        off = residual - row[0] * x - row[1] * y - row[2] * h
-        cost += k * off * off
-        x, y, h = x + k * off * px, y + k * off * py, h + k * off * ph
-        gained = Covariance3(px * px, px * py, py * py, px * ph, py * ph, ph * ph)
-        covariance = covariance.plus(gained, -k)
-    pose = estimate.pose
-    moved = Pose2(pose.x + x, pose.y + y, wrap_angle(pose.heading + h))
-    return Estimate(moved, covariance), cost
+    return state.cost + OUTLIER * (len(evidence) - used), pose

@@ -11,7 +11,7 @@ from typing import Final
 
 from cpcbl_team.estimate import Covariance3, Estimate
 from cpcbl_team.geometry import Pose2
-from cpcbl_team.relocalization import DRIFT_SHARE, UNKNOWNS, are_apart, chi_square_bound
+from cpcbl_team.relocalization import UNKNOWNS, are_apart, chi_square_bound, drift_sigmas
 from cpcbl_team.sensor_mistakes import ExplainingMistake, mistake_in_evidence
 from cpcbl_team.state import Evidence, Jump, RecoveryMemory, State, TrustedPose, with_recovery
 
@@ -27,9 +27,7 @@ def trusted_pose(state: State) -> TrustedPose:
 def propagated_pose(trusted: TrustedPose, odometry_from_robot: Pose2) -> Estimate:
     """The trusted pose at present, by odometry alone: wider by what dead reckoning may err."""
     moved = trusted.odometry_from_robot.inverse() @ odometry_from_robot
-    way, turn = math.hypot(moved.x, moved.y), abs(moved.heading)
-    p = (DRIFT_SHARE * (way + 0.3 * turn)) ** 2
-    h = (DRIFT_SHARE * (turn + 0.3 * way)) ** 2
+    p, h = (sigma * sigma for sigma in drift_sigmas(moved))
     pose = trusted.estimate.pose @ moved
     return Estimate(pose, trusted.estimate.covariance.plus(Covariance3(p, 0.0, p, 0.0, 0.0, h)))
 

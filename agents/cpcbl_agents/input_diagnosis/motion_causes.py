@@ -90,7 +90,6 @@ def _in_degrees(step: Step) -> float:
 DEGREE = math.radians(1.0)
 MIRRORED = "turns or bearings have the wrong sign; left is positive"
 FIXED = mistakes.FIXED
-_90_OFF = mistakes.QUARTER_OFF
 _SINCE = "distances look like distances since the start, not of each piece"
 _HEADINGS = "turns look like headings, not turns of each piece"
 _MM, _CM = "distances look like millimetres", "distances look like centimetres"
@@ -112,8 +111,8 @@ MISTAKES = (
     Mistake(
         "distances have the wrong sign or frame, or bearings are 180° off", _distance, _turn, -1.0
     ),
-    Mistake(_90_OFF, _distance, _turn, 1.0j),
-    Mistake(_90_OFF, _distance, _turn, -1.0j),
+    Mistake(mistakes.QUARTER_OFF, _distance, _turn, 1.0j),
+    Mistake(mistakes.QUARTER_OFF, _distance, _turn, -1.0j),
     Mistake(f"{_HEADINGS}, and {_SINCE}", None, turn_total=1.0),
     Mistake(f"turns look like headings in degrees, and {_SINCE}", None, turn_total=DEGREE),
     Mistake("distances and turns look like speeds (m/s, rad/s)", _distance_of_speed, _turn_of_rate),
@@ -327,18 +326,9 @@ def scale_of(frames: Iterable[Sightings], landmarks: Mapping[str, Landmark]) -> 
 # Against the map, near the start ----------------------------------------------------------------
 
 OR_START = "or the robot is not where its `start` says"
-_VIEWS: tuple[tuple[str, Callable[[complex, float], complex]], ...] = (
+_VIEWS: tuple[tuple[str, mistakes.View], ...] = (
     ("", lambda p, h: p),
-    (mistakes.MIRRORED, lambda p, h: p.conjugate()),
-    (_90_OFF, lambda p, h: p * 1j),
-    (_90_OFF, lambda p, h: p / 1j),
-    (mistakes.HALF_OFF, lambda p, h: -p),
-    ("bearings count from x of the field, not from ahead", lambda p, h: p * cmath.rect(1.0, -h)),
-    (
-        "bearings count from north, not from ahead",
-        lambda p, h: 1j * p.conjugate() * cmath.rect(1.0, -h),
-    ),
-    (mistakes.IN_FEET, lambda p, h: p * mistakes.FOOT_M),
+    *((mistake.text, mistake.view) for mistake in mistakes.MISTAKES),
 )
 
 
