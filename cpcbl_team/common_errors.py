@@ -256,17 +256,12 @@ def updated_by_teammate(
 def independent_readings(
     observation: Observation, noise: Covariance2, sensitivities: tuple[Pair, ...]
 ) -> list[Reading]:
-    """The one or two scalars of an observation as independent ones (R = L L^T)."""
-    (first, *rest), (e, *others), (c, *of_rest) = (
-        observation.rows,
-        observation.residuals,
-        sensitivities,
-    )
-    readings = [Reading(first, c, e, noise.xx)]
-    if rest:
-        k, (x, y, a), (u, v) = noise.xy / noise.xx, rest[0], of_rest[0]
-        row = x - k * first[0], y - k * first[1], a - k * first[2]
-        sensitivity = u - k * c[0], v - k * c[1]
-        variance = noise.yy - k * noise.xy
-        readings.append(Reading(row, sensitivity, others[0] - k * e, variance))
-    return readings
+    """The one or two scalars of an observation as independent ones."""
+    if len(sensitivities) == 2:
+        k, ((a, b), (c, d)) = noise.xy / noise.xx, sensitivities
+        sensitivities = (a, b), (c - k * a, d - k * b)
+    scalars = observation.independent_scalars(noise)
+    return [
+        Reading(row, sensitivity, residual, variance)
+        for (row, residual, variance), sensitivity in zip(scalars, sensitivities, strict=True)
+    ]

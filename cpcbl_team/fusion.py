@@ -59,15 +59,17 @@ class Observation(NamedTuple):
 
     def information(self, noise: Covariance2 | None = None) -> Information:
         """The evidence with this covariance of the residuals; default: `noise()`."""
-        r = noise or self.noise()
+        return Information.none().with_all(self.independent_scalars(noise or self.noise()))
+
+    def independent_scalars(self, r: Covariance2) -> tuple[tuple[Row, float, float], ...]:
+        """Row, residual and variance of one or two independent scalars, with this covariance of the
+        residuals (R = L L^T)."""
         if len(self.rows) == 1:
-            return Information.none().add(self.rows[0], self.residuals[0], r.xx)
-        # Two correlated scalars become two independent ones (r = L L^T).
+            return ((self.rows[0], self.residuals[0], r.xx),)
         (first, second), (e, f) = self.rows, self.residuals
         k = r.xy / r.xx
         second = (second[0] - k * first[0], second[1] - k * first[1], second[2] - k * first[2])
-        both = (first, e, r.xx), (second, f - k * e, r.yy - k * r.xy)
-        return Information.none().with_all(both)
+        return (first, e, r.xx), (second, f - k * e, r.yy - k * r.xy)
 
     def normalized_innovation_squared(self, prior: Covariance3) -> float:
         """e^T (H P H^T + R)^-1 e: chi-square with as many degrees of freedom as rows."""
