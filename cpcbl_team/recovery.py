@@ -25,6 +25,7 @@ from cpcbl_team.state import (
     Evidence,
     RecoveryMemory,
     State,
+    with_common_errors,
     with_recovery,
 )
 from cpcbl_team.trust import reset_scores
@@ -302,6 +303,8 @@ class Recovery:
         self, state: State, memory: RecoveryMemory, mistake: ExplainingMistake | None
     ) -> State:
         kept = keep_trusted_pose(state, memory, mistake, self._reduce)
+        if (common := state.common_errors) is not None:  # its covariances are with another pose
+            kept = with_common_errors(kept, common.uncorrelated())
         if mistake is None or memory.mistake:
             return kept
         # What was accepted at another pose says nothing of this one.

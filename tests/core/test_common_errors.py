@@ -211,3 +211,25 @@ def test_exact_cameras_and_variants_that_keep_the_heading_apart_have_no_common_e
     assert not considers_camera(usual, CameraSettings(yaw_sigma_deg=0.0, focal_share=0.0))
     for rules in (LocalizerSettings(variant="oval"), LocalizerSettings(alternate=True)):
         assert not considers_camera(replace(usual, localizer=rules), camera)
+
+
+def test_the_trusted_pose_is_kept_without_covariances_with_another_pose() -> None:
+    drive = Drive(NO_ERRORS)
+    state, pose = run(drive, 0, 3.0)[-1]
+    localizer, random = localizer_of(drive), np.random.default_rng(1)
+    common = state.common_errors
+    assert common is not None
+    assert any(common.of_yaw)
+    for _ in range(30):  # it stands, and its driver turns bearings
+        now_ns = state.stamp_ns + STEP_NS
+        state = localizer.add_odometry(state, Odometry(state.stamp_ns, now_ns, 0.0, 0.0))
+        seen = [
+            replace(s, bearing_rad=-(s.bearing_rad or 0.0)) for s in frame_at(pose, drive, random)
+        ]
+        state = localizer.cycle(state, Sightings(now_ns, tuple(seen)))
+        if state.memory.recovery.mistake:
+            break
+    assert state.memory.recovery.mistake
+    common = state.common_errors
+    assert common is not None
+    assert not any((*common.of_yaw, *common.of_focal))
