@@ -10,7 +10,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import ExitStack, contextmanager, nullcontext
 from pathlib import Path
 
 import pytest
@@ -20,7 +20,13 @@ from support.routers import open_router
 
 from cpcbl_launch.lab.chaos.checks import Check, Outcome
 from cpcbl_launch.lab.chaos.injectors import echoes
-from cpcbl_launch.lab.chaos.links import LinkQuality, Relay, TunLink, missing_tun
+from cpcbl_launch.lab.chaos.links import (
+    MOST_CONNECTIONS,
+    LinkQuality,
+    Relay,
+    TunLink,
+    missing_tun,
+)
 from cpcbl_launch.lab.chaos.runner import run_scenario, run_scenarios, select_scenarios
 from cpcbl_launch.lab.chaos.scenario import (
     Requirement,
@@ -222,6 +228,15 @@ def test_a_relay_forwards_that_an_end_has_closed() -> None:
         with dial(relay.endpoint) as link:
             link.shutdown(socket.SHUT_WR)
             assert link.recv(10) == b""
+
+
+def test_a_relay_carries_no_more_connections_than_it_may() -> None:
+    with echo_server() as server, Relay(server) as relay, ExitStack() as stack:
+        first = stack.enter_context(dial(relay.endpoint))
+        round_trip_s(first, b"x")
+        links = [stack.enter_context(dial(relay.endpoint)) for _ in range(MOST_CONNECTIONS)]
+        assert links[-1].recv(10) == b""
+        round_trip_s(first, b"x")
 
 
 @pytest.mark.skipif(bool(missing_tun()), reason="needs root and /dev/net/tun")

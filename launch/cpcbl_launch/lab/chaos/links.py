@@ -17,6 +17,7 @@ from cpcbl_launch.run.up import free_endpoint
 
 CHUNK = 4096
 POLL_S = 0.01
+MOST_CONNECTIONS = 64  # of a relay; a robot keeps one
 TUN = Path("/dev/net/tun")
 _SET_INTERFACE, _TUN_WITHOUT_HEADER = 0x400454CA, 0x1001
 _MTU = 1500
@@ -45,6 +46,7 @@ class Relay:
         self._protocol, address = router.split("/")
         self._router, self._random = address.rsplit(":", 1), random.Random(seed)
         self.quality = LinkQuality()
+        self._connections = 0
 
     def __enter__(self) -> Self:
         self._listener = socket.create_server(("127.0.0.1", 0))
@@ -77,7 +79,12 @@ class Relay:
         server.close()
 
     async def _connect(self, client: asyncio.StreamReader, to_client: asyncio.StreamWriter) -> None:
-        """Carries one connection until either side closes it."""
+        """Carries one connection until either side closes it; closes it at once if there are too
+        many, so that a client that dials without end takes no file descriptors from the run."""
+        if self._connections >= MOST_CONNECTIONS:
+            to_client.close()
+            return
+        self._connections += 1
         sinks = [to_client]
         try:
             router, to_router = await asyncio.open_connection(*self._router)
@@ -90,6 +97,7 @@ class Relay:
         except* (OSError, EOFError):
             pass  # either side may leave at any time
         finally:
+            self._connections -= 1
             for sink in sinks:
                 sink.close()
 
