@@ -67,13 +67,13 @@ def test_driver_and_consumer_wait_for_a_router_and_survive_its_end(tmp_path: Pat
 @pytest.mark.parametrize("name", ["external_driver", "tripod_driver", "pose_consumer", "init"])
 def test_an_example_that_waits_ends_without_a_traceback(name: str, tmp_path: Path) -> None:
     program, team = DOCS / f"{name}.py", tmp_path / "team.toml"
-    words = (sys.executable, str(program), str(team), "r1")
     if name == "init":
         command_line("init", tmp_path, "--yes", "--router", free_endpoint())
-        words = (sys.executable, str(tmp_path / "driver.py"))
+        program = tmp_path / "driver.py"
     else:
         team.write_text(TEAM.format(endpoint=free_endpoint()))
-    with programs(tmp_path, example=words) as running:
+    own = () if name == "init" else (str(team), "r1")
+    with programs(tmp_path, example=(sys.executable, str(program), *own)) as running:
         assert eventually(lambda: "waiting for a router at" in running["example"].said)
     assert running["example"].process.returncode == 0
     assert "Traceback" not in running["example"].said
