@@ -130,3 +130,17 @@ def test_the_pose_says_so_too() -> None:
     assert found[-1].lost == ""
     assert {pose.unconfirmed for pose in found if pose.lost} <= {""}
     assert all(pose.unconfirmed for pose in found if not pose.lost)
+
+
+def test_many_rejected_measurements_are_said_before_the_robot_is_lost() -> None:
+    weave = World(
+        lambda t: (0.15 * math.cos(0.6 * t), 0.3 * math.cos(0.6 * t)), THREE, START, seed=24
+    )
+    robot = DrivenRobot(weave)
+    robot.run(10.1)
+    assert {s.unconfirmed for s in robot.statuses} == {""}
+    before = len(robot.statuses)
+    robot.run(6.0, ODOMETRY["headings in degrees"].make())
+    said = [s for s in robot.statuses[before:] if s.unconfirmed]
+    assert "the robot rejects" in said[0].unconfirmed
+    assert not any(s.lost for s in said)

@@ -13,7 +13,7 @@ from typing import NamedTuple, TypeVar
 from cpcbl_agents.input_diagnosis.implausible_errors import ImplausibleErrors
 from cpcbl_agents.input_diagnosis.jumps import JumpMonitor
 from cpcbl_agents.input_diagnosis.motion_causes import CONTRADICTION, Step, pose_near_start
-from cpcbl_agents.input_diagnosis.pose_confirmation import PoseConfirmation
+from cpcbl_agents.input_diagnosis.pose_confirmation import PoseConfirmation, rejections_text
 from cpcbl_agents.input_diagnosis.problem_hysteresis import ProblemHysteresis
 from cpcbl_agents.input_diagnosis.problems import (
     MOTION,
@@ -144,6 +144,7 @@ class InputMonitor:
             and settings.sensing == "sightings"
             and settings.sensor.sees_landmarks
         )
+        self._is_driven, self._rejections = settings.source == "external", ""
         self._starts_known: bool | None = None
         self._jumps = JumpMonitor(start_ns, settings.odometry.moves)
         self._errors = ImplausibleErrors()
@@ -176,7 +177,7 @@ class InputMonitor:
     @property
     def unconfirmed(self) -> str:
         """What is not confirmed about the pose, and why; empty if nothing is missing."""
-        return self._confirmation.reason
+        return self._confirmation.reason or self._rejections
 
     def judge(
         self, snapshot: InputSnapshot, now_ns: int, namesake: bool
@@ -198,6 +199,7 @@ class InputMonitor:
             camera_lost=snapshot.is_camera_lost,
             mistake=snapshot.mistake,
         )
+        self._rejections = rejections_text(*snapshot.rejected) if self._is_driven else ""
         problems = input_problems(facts)
         self._judgements += any(self.inputs[name].messages for name in shown)
         is_early = self._judgements < OFTEN

@@ -19,7 +19,20 @@ LONG_NS: Final = 10_000_000_000  # for so long nothing was wrong: that is enough
 CLEAR_M: Final = 1.0  # in all: landmarks should have shown it,
 DRIVEN_M: Final = 0.05  # and below, the robot stands or turns on the spot
 TURNED_RAD: Final = 1.0  # in all: mirrored bearings would have shown
+MOST_REJECTED: Final = 6  # of the latest 20 innovations; right drivers seldom have more
 _REMEDY: Final = "drive it past landmarks, or state its start"
+
+
+def rejections_text(rejected: int, latest: int) -> str:
+    """What many rejected measurements say about the pose, before the robot is lost; empty if they
+    are few."""
+    if rejected <= MOST_REJECTED:
+        return ""
+    return (
+        f"the pose is not confirmed: the robot rejects {rejected} of its last {latest}"
+        " measurements; its odometry, its sightings, its settings or the map are wrong, or it was"
+        " carried"
+    )
 
 
 class PoseConfirmation:
