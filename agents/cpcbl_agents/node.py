@@ -117,6 +117,7 @@ class Node:
         self.received = MessageCounters()
         self._clocks = ClockMonitor(rules.trust, speed) if rules.trust.enabled else None
         self._health = InputMonitor(robot.name, team, start_ns, speed)
+        self._pose.unconfirmed = self._health.unconfirmed
         self._namesakes: set[str] = set()  # tokens of other processes with this robot's name
         self._inputs = [
             bus.subscribe(topic.at(robot=robot.name), self._on_message) for topic in topics.INPUTS
@@ -299,7 +300,13 @@ class Node:
             self.robot.forget_wrong_inputs(now_ns)
         overload = self._load.judge(len(self._inbox), self._inbox.pop_dropped())
         problems = (*overload, *problems, *self.robot.sensing.problems)
-        status = msgspec.structs.replace(status, inputs=inputs, problems=problems)
+        self._pose.unconfirmed = self._health.unconfirmed
+        status = msgspec.structs.replace(
+            status,
+            inputs=inputs,
+            problems=problems,
+            unconfirmed="" if status.lost else self._health.unconfirmed,
+        )
         self._callbacks.on_status(status)
         self._publish(status)
         key = topics.json_key(topics.STATUS.at(robot=self._name))

@@ -1,5 +1,7 @@
 """A robot's pose as an output, at its own rate, while somebody subscribes."""
 
+import msgspec
+
 from cpcbl_agents.robot import NEVER_NS, Robot
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus
@@ -17,6 +19,8 @@ class PoseOutput:
         self._as_json = bus.publisher(topics.json_key(key), qos)
         self._due_ns = self._sent_ns = start_ns
         self._has_subscribers = False
+        self.unconfirmed = ""
+        """What is not confirmed about the pose, unless the robot is lost."""
 
     @property
     def next_ns(self) -> int:
@@ -35,6 +39,8 @@ class PoseOutput:
             return
         self._due_ns = max(self._due_ns + self._interval_ns, now_ns + self._interval_ns // 2)
         pose = self._robot.pose(now_ns)
+        if self.unconfirmed and not pose.lost:
+            pose = msgspec.structs.replace(pose, unconfirmed=self.unconfirmed)
         if pose.stamp_ns <= self._sent_ns:
             return
         self._sent_ns = pose.stamp_ns

@@ -23,6 +23,7 @@ from cpcbl_team.camera_filter import considers_camera
 from cpcbl_team.config import Team
 from cpcbl_team.estimate import Estimate
 from cpcbl_team.inputs import BeliefShared, InputsMended, SightingFault
+from cpcbl_team.recovery import rejected_of
 from cpcbl_team.state import CalibrationMemory, Jump
 from cpcbl_team.trust import TrustStatus
 from cpcbl_transport.budget import Budget
@@ -41,6 +42,7 @@ class InputSnapshot(NamedTuple):
     is_camera_lost: bool
     mistake: str = ""  # of the driver, that explains why the robot is lost
     jump: Jump | None = None  # the latest
+    rejected: tuple[int, int] = (0, 0)  # of the latest innovations, and how many these are
 
 
 class Robot:
@@ -112,7 +114,9 @@ class Robot:
         is_camera_lost = camera["camera_lost"] > camera["camera_back"]
         known, recovery = state.memory.calibration, state.memory.recovery
         pose = state.estimate, recovery.lost, known
-        return InputSnapshot(*pose, refused, is_camera_lost, recovery.mistake, recovery.jump)
+        rejected = rejected_of(state.updates.innovations)
+        found = recovery.mistake, recovery.jump, rejected
+        return InputSnapshot(*pose, refused, is_camera_lost, *found)
 
     def pose(self, now_ns: int) -> Pose:
         """The pose at `now_ns`, or at the end of the newest odometry."""

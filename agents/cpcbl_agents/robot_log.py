@@ -19,6 +19,7 @@ class RobotLogger:
         self._fed: set[str] = set()
         self._heard: set[str] = set()
         self._lost: str | None = None
+        self._unconfirmed = ""
         self._problems: dict[str, str] = {}
 
     def log_connected(self, team: Team, endpoints: Sequence[str]) -> None:
@@ -41,6 +42,9 @@ class RobotLogger:
         if (lost := without_numbers(status.lost)) != self._lost:
             self._lost = lost
             self._log_pose(status)
+        if (what := without_numbers(status.unconfirmed)) != self._unconfirmed and not lost:
+            self._unconfirmed = what
+            log.info("%s: %s", self._robot, status.unconfirmed or "its pose is confirmed")
         problems = {without_numbers(text): text for text in status.problems}
         for what, text in problems.items():
             if what not in self._problems:

@@ -81,6 +81,7 @@ def test_json_is_sent_to_those_who_ask_for_it() -> None:
         "heading_rad": pytest.approx(1.5707963),
         "covariance": (),
         "lost": "",
+        "unconfirmed": "",
     }
     assert json.loads(status_ear.payloads[0])["counts"]["odometry"] == 10
 

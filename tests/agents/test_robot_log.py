@@ -10,6 +10,18 @@ from cpcbl_agents.robot_log import RobotLogger
 from cpcbl_transport.messages import Flow, InputHealth
 
 
+def test_what_is_not_confirmed_is_logged_until_it_is(caplog: pytest.LogCaptureFixture) -> None:
+    logger = RobotLogger("r1")
+    with caplog.at_level(logging.INFO):
+        for seconds, unconfirmed in ((1.0, "stood"), (2.0, "stood"), (3.0, ""), (4.0, "")):
+            logger.log_status(status("r1", seconds, 3, unconfirmed=unconfirmed))
+    assert [record.message for record in caplog.records] == [
+        "r1: knows its pose, position σ 0.04 m",
+        "r1: stood",
+        "r1: its pose is confirmed",
+    ]
+
+
 def test_each_thing_is_said_once(caplog: pytest.LogCaptureFixture) -> None:
     logger, health = RobotLogger("r1"), InputHealth("odometry", 10.0, 1, 5)
     silent = "no odometry on in/r1/odometry for {} s"

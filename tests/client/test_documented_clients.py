@@ -7,8 +7,9 @@ import time
 from contextlib import ExitStack
 from pathlib import Path
 
+import pytest
 import zenoh
-from support.processes import eventually
+from support.processes import command_line, eventually
 from support.programs import programs
 from support.routers import open_router
 
@@ -58,6 +59,24 @@ def test_driver_and_consumer_wait_for_a_router_and_survive_its_end(tmp_path: Pat
             assert eventually(lambda: len(consumer.printed) >= before + 5)
     where = [float(number) for number in consumer.printed[-1].split(" lost")[0].split()]
     assert len(where) == 3
+    for client in clients.values():
+        assert client.process.returncode == 0  # after SIGINT
+        assert "Traceback" not in client.said
+
+
+@pytest.mark.parametrize("name", ["external_driver", "tripod_driver", "pose_consumer", "init"])
+def test_an_example_that_waits_ends_without_a_traceback(name: str, tmp_path: Path) -> None:
+    program, team = DOCS / f"{name}.py", tmp_path / "team.toml"
+    if name == "init":
+        command_line("init", tmp_path, "--yes", "--router", free_endpoint())
+        program = tmp_path / "driver.py"
+    else:
+        team.write_text(TEAM.format(endpoint=free_endpoint()))
+    own = () if name == "init" else (str(team), "r1")
+    with programs(tmp_path, example=(sys.executable, str(program), *own)) as running:
+        assert eventually(lambda: "waiting for a router at" in running["example"].said)
+    assert running["example"].process.returncode == 0
+    assert "Traceback" not in running["example"].said
 
 
 def test_another_language_speaks_json_over_zenoh(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import pytest
+from support.processes import command_line
 from typer.testing import CliRunner
 
 from cpcbl_launch.app import build_app
@@ -87,3 +88,35 @@ def test_check_prints_them_and_finds_the_team_good(tmp_path: Path) -> None:
     result = CliRunner().invoke(build_app(), ["check", str(path)])
     assert result.exit_code == 0, result.output
     assert "warning: robots.r1: one object on the map" in result.output
+
+
+def test_check_says_unusual_numbers_beside_faults(tmp_path: Path) -> None:
+    file = tmp_path / "team.toml"
+    file.write_text(
+        'name = "lab"\n[map.landmarks]\ndoor = { x_m = 2.0, y = 0.2 }\n'
+        "desk = { x_m = 3.0, y_m = 1.0 }\n[vision]\nmarker_m = 160\n"
+        '[robots.r1]\nsource = "extern"\nsensor.range_sigma_m = 0.1\nsensor.range_share = 4\n'
+        "start = { x = 1.0, y_m = 1.0 }\n"
+    )
+    ran = command_line("check", file)
+    assert ran.returncode == 2
+    for key in ("door.y", "r1.source", "r1.sensor.range_sigma_m", "r1.start.x"):
+        assert f"{key}: " in ran.stderr
+    warned = [line for line in ran.stderr.splitlines() if "warning" in line]
+    assert [line.split(": ")[2] for line in warned] == [
+        "robots.r1.sensor.range_share",
+        "vision.marker_m",
+    ]
+
+
+@pytest.mark.parametrize(
+    "text", ["name = ", "robots = 3", "[robots.r1]\n'a.b' = 1\n[map]\nx = [1]"]
+)
+def test_check_of_a_file_that_leaves_no_team_says_its_faults_alone(
+    text: str, tmp_path: Path
+) -> None:
+    file = tmp_path / "team.toml"
+    file.write_text(text)
+    ran = command_line("check", file)
+    assert ran.returncode == 2
+    assert "warning" not in ran.stderr

@@ -68,7 +68,7 @@ class DrivenRobot:
         marks = {name: Landmark(x_m=x, y_m=y) for name, (x, y) in world.places.items()}
         self.team = Team(name="lab", robots={"r1": robot, "r2": base}, map=Field(landmarks=marks))
         self.world, self.random = world, random.Random(world.seed)
-        hub = MemoryHub()
+        self.hub = hub = MemoryHub()
         out = hub.session()
         self._publishers: dict[type, Publisher] = {
             kind: out.publisher(topic.at(robot="r1"), topic.qos) for kind, topic in TOPICS.items()

@@ -43,9 +43,12 @@ STATUS = msgspec.structs.replace(STATUS, sent=SENT, heard=SENT[:1], spending=SPE
 OLDER_STATUS = STATUS  # as the first releases sent it
 INPUTS = (InputHealth("odometry", 9.5, NOW, 7, {"too_late": 2}, 0.02),)
 STATUS = msgspec.structs.replace(STATUS, inputs=INPUTS, problems=("camera lost",))
+CONFIRMED_STATUS = STATUS  # as robots sent it that did not know of unconfirmed poses
+STATUS = msgspec.structs.replace(STATUS, unconfirmed="it stood")
 TRACK = Track("r1", NOW, 1.0, 2.0, 0.5, COVARIANCE, 3)
 ROWS = ((0.04, 0.01, 0.0), (0.01, 0.09, 0.0), (0.0, 0.0, 0.01))
-POSE = Pose("r1", NOW, 1.0, 2.0, 0.5, ROWS, "kidnapped")
+CONFIRMED_POSE = Pose("r1", NOW, 1.0, 2.0, 0.5, ROWS, "kidnapped")
+POSE = msgspec.structs.replace(CONFIRMED_POSE, unconfirmed="it stood")
 DRIVE = Drive("r1", NOW, 0.5, 0.1)
 MODEL = SimulatedRobotModel(StartModel(x_m=1.0, y_m=2.0), position_sensor=PositionSensorModel())
 JOIN = Join("tripod", "a", NOW, MODEL)

@@ -153,6 +153,11 @@ def test_the_bytes_of_a_fix_and_a_belief_are_frozen(message: Help, name: str) ->
     assert encode_help(message).hex() == GOLDEN[name]
 
 
+def test_a_status_and_a_pose_without_unconfirmed_are_still_understood() -> None:
+    for name, due in (("status", samples.CONFIRMED_STATUS), ("pose", samples.CONFIRMED_POSE)):
+        assert decode_tagged(bytes.fromhex(GOLDEN[f"{name} without unconfirmed"])) == due
+
+
 def test_a_status_without_inputs_is_still_understood() -> None:
     assert decode_tagged(bytes.fromhex(GOLDEN["status without inputs"])) == samples.OLDER_STATUS
 

@@ -125,6 +125,9 @@ class Status(msgspec.Struct, frozen=True, array_like=True, tag="status"):
     inputs: tuple[InputHealth, ...] = ()
     problems: tuple[str, ...] = ()
     """What is wrong with the inputs, as sentences for people, the worst first."""
+    unconfirmed: str = ""
+    """What nothing confirms about a pose that was found without a known start, and why; the state
+    is then not ok. Empty while the robot is lost."""
 
 
 class Track(msgspec.Struct, frozen=True, array_like=True, tag="track"):
@@ -148,7 +151,8 @@ class Pose(msgspec.Struct, frozen=True, array_like=True, tag="pose"):
 
     `stamp_ns`: the time for which it holds, that of the newest odometry. `covariance`: rows of x, y
     and heading (m^2, m rad, rad^2); None where the variant has none. `lost`: why the robot is lost,
-    empty while it is not; the pose of a lost robot is not to be used.
+    empty while it is not; the pose of a lost robot is not to be used. `unconfirmed`: what nothing
+    confirms about a pose that was found without a known start, and why; else empty.
     """
 
     robot: Name
@@ -158,6 +162,7 @@ class Pose(msgspec.Struct, frozen=True, array_like=True, tag="pose"):
     heading_rad: float
     covariance: tuple[Row3, Row3, Row3] | None
     lost: str = ""
+    unconfirmed: str = ""
 
 
 class Drive(msgspec.Struct, frozen=True, array_like=True, tag="drive"):

@@ -12,12 +12,9 @@ from typing import NamedTuple, TypeVar
 
 from cpcbl_agents.input_diagnosis.implausible_errors import ImplausibleErrors
 from cpcbl_agents.input_diagnosis.jumps import JumpMonitor
-from cpcbl_agents.input_diagnosis.motion_causes import (
-    CONTRADICTION,
-    OR_START,
-    Step,
-    pose_near_start,
-)
+from cpcbl_agents.input_diagnosis.motion_causes import CONTRADICTION, Step, pose_near_start
+from cpcbl_agents.input_diagnosis.pose_confirmation import PoseConfirmation, rejections_text
+from cpcbl_agents.input_diagnosis.problem_hysteresis import ProblemHysteresis
 from cpcbl_agents.input_diagnosis.problems import (
     MOTION,
     InputFacts,
@@ -26,13 +23,11 @@ from cpcbl_agents.input_diagnosis.problems import (
     implausible_inputs,
     input_problems,
     is_often_refused,
-    without_numbers,
 )
 from cpcbl_agents.robot import InputSnapshot
 from cpcbl_team.config import RobotSettings, Start, Team
 from cpcbl_team.geometry import Pose2, wrap_angle
 from cpcbl_team.inputs import Odometry, Sightings
-from cpcbl_team.trusted_pose import OR_MOVED
 from cpcbl_transport import topics
 from cpcbl_transport.messages import (
     LARGEST_FRAME,
@@ -51,8 +46,6 @@ SECOND_NS, EMPTY_NS = 1_000_000_000, 5_000_000_000
 UNSEEN = 25  # judgements: in real logs a robot saw nothing for 20 s in front of landmarks
 EMPTY_CAME = "empty frames came too before"
 IN_VIEW = "a landmark should be in view"
-OVER = 4  # judgements in a row that find nothing, before a cause is no longer reported
-CHANGED = 30  # judgements in a row that find another cause, before it replaces the first
 STEP_NS = 95_000_000
 STEPS = 200
 LONGER_NS = (
@@ -126,60 +119,6 @@ class Input:
         self.recent_refused.append((now_ns, payload[:LARGEST_FRAME]))
 
 
-class ProblemHysteresis:
-    """Keeps reported problems from flapping. A reported problem stays reported until several
-    judgements in a row find nothing, or many in a row find another cause."""
-
-    def __init__(self) -> None:
-        self._reported: dict[str, str] = {}
-        self._candidates: dict[str, str] = {}
-        self._misses: Counter[str] = Counter()
-
-    def __bool__(self) -> bool:
-        return bool(self._reported or self._candidates)
-
-    def __contains__(self, about: str) -> bool:
-        return about in self._reported
-
-    @property
-    def reported_by_start(self) -> dict[str, str]:
-        """The problems reported now that assume the robot was at its start, by subject."""
-        return {about: text for about, text in self._reported.items() if OR_START in text}
-
-    def update(self, found: dict[str, str]) -> tuple[str, ...]:
-        """Takes what this judgement found, by subject, and returns the problems to report."""
-        for about in {**self._reported, **self._candidates, **found}:
-            self._judge(about, found.get(about, ""))
-        return tuple(self._reported.values())
-
-    def _judge(self, about: str, text: str) -> None:
-        reported = self._reported.get(about, "")
-        if reported and _problem_key(reported) == _problem_key(text):
-            if OR_START not in reported and OR_MOVED not in reported:
-                self._reported[about] = text
-            self._misses[about] = 0
-            return
-        is_again = bool(text) and _problem_key(self._candidates.get(about, "")) == _problem_key(
-            text
-        )
-        self._candidates[about] = text
-        if not text:
-            del self._candidates[about]
-        self._misses[about] += 1
-        if reported and self._misses[about] < (CHANGED if text else OVER):
-            return
-        self._reported.pop(about, None)
-        if is_again:
-            self._reported[about] = text
-            self._misses[about] = 0
-
-
-def _problem_key(text: str) -> str:
-    """The text of a problem without its figures and evidence: two problems with the same key have
-    the same cause."""
-    return without_numbers(text).removesuffix(f"; {OR_START}").removesuffix(f"; {OR_MOVED}")
-
-
 class _Totals(NamedTuple):
     """All counts at the time of a judgement."""
 
@@ -205,9 +144,15 @@ class InputMonitor:
             and settings.sensing == "sightings"
             and settings.sensor.sees_landmarks
         )
+        self._is_driven, self._rejections = settings.source == "external", ""
         self._starts_known: bool | None = None
         self._jumps = JumpMonitor(start_ns, settings.odometry.moves)
         self._errors = ImplausibleErrors()
+        self._confirmation = PoseConfirmation(
+            is_start_known=not self._sees or _start_pose(settings.start) is not None,
+            moves=settings.odometry.moves,
+            now_ns=start_ns,
+        )
         self._hysteresis, self._implausible = ProblemHysteresis(), tuple[str, ...]()
         self.are_mended = self._are_wrong = False
         """Whether inputs were wrong before the last judgement, and are right."""
@@ -229,6 +174,11 @@ class InputMonitor:
             pace=max(1.0, speed),
         )
 
+    @property
+    def unconfirmed(self) -> str:
+        """What is not confirmed about the pose, and why; empty if nothing is missing."""
+        return self._confirmation.reason or self._rejections
+
     def judge(
         self, snapshot: InputSnapshot, now_ns: int, namesake: bool
     ) -> tuple[tuple[InputHealth, ...], tuple[str, ...]]:
@@ -249,11 +199,14 @@ class InputMonitor:
             camera_lost=snapshot.is_camera_lost,
             mistake=snapshot.mistake,
         )
+        self._rejections = rejections_text(*snapshot.rejected) if self._is_driven else ""
         problems = input_problems(facts)
         self._judgements += any(self.inputs[name].messages for name in shown)
         is_early = self._judgements < OFTEN
-        if self._hysteresis or is_early or snapshot.lost or self._judgements % SELDOM == 0:
-            self._implausible = self._find_implausible(snapshot, facts, before, bool(problems))
+        is_due = bool(self._hysteresis or snapshot.lost or self._confirmation.is_awaited)
+        if is_due or is_early or self._judgements % SELDOM == 0:
+            facts = self._with_latest(snapshot, facts, before.now_ns)
+            self._implausible = self._find_implausible(snapshot, facts, bool(problems), now_ns)
         are_wrong = bool(self._implausible) or any(map(is_often_refused, facts.windows.values()))
         self.are_mended, self._are_wrong = self._are_wrong and not are_wrong, are_wrong
         health = tuple(self._health(name, totals, before) for name in shown)
@@ -261,12 +214,12 @@ class InputMonitor:
         jumps = self._jumps.judge(snapshot.jump, self.inputs["odometry"].steps, now_ns)
         return health, said or jumps
 
-    def _find_implausible(
-        self, snapshot: InputSnapshot, facts: InputFacts, before: _Totals, has_problems: bool
-    ) -> tuple[str, ...]:
-        """Judges what is implausible about the inputs, and returns the problems to report."""
+    def _with_latest(
+        self, snapshot: InputSnapshot, facts: InputFacts, before_ns: int
+    ) -> InputFacts:
+        """The facts with the odometry and the sightings of the last seconds."""
         is_early = len(self._history) <= WINDOW
-        since_ns = self._start_ns if is_early else before.now_ns
+        since_ns = self._start_ns if is_early else before_ns
         if self._starts_known is None:
             self._starts_known = not snapshot.lost or bool(snapshot.mistake)
         steps = _since_stamp(self.inputs["odometry"].steps, since_ns)
@@ -275,7 +228,7 @@ class InputMonitor:
             near = pose_near_start(steps, facts.start)
         self._judgements_away = 0 if near is not None else self._judgements_away + 1
         seen, long_ns = self.inputs["sightings"], max(self._start_ns, since_ns - LONGER_NS)
-        facts = facts._replace(
+        return facts._replace(
             corrections=self._errors.update(snapshot.calibration, MOTION in self._hysteresis),
             near_start=near,
             is_from_start=is_from_start,
@@ -285,11 +238,19 @@ class InputMonitor:
             long_steps=_since_stamp(self.inputs["odometry"].steps, long_ns),
             long_frames=[frame for _, frame in _since(seen.spaced, long_ns)],
         )
+
+    def _find_implausible(
+        self, snapshot: InputSnapshot, facts: InputFacts, has_problems: bool, now_ns: int
+    ) -> tuple[str, ...]:
+        """Judges what is implausible about the inputs, and returns the problems to report."""
         self.is_mistake_contradicted = contradicts_mistake(facts)
         found = implausible_inputs(facts)
         if has_problems and CONTRADICTION in found.get(MOTION, ""):
             del found[MOTION]
-        return self._hysteresis.update(found)
+        reported = self._hysteresis.update(found)
+        is_wrong = bool(found or reported or has_problems or snapshot.lost)
+        self._confirmation.judge(facts, snapshot.jump if self._sees else None, is_wrong, now_ns)
+        return reported
 
     def _reported_by_start(self, is_lost: bool) -> dict[str, str]:
         """The problems reported because of where the robot started that still hold unless inputs

@@ -300,6 +300,13 @@ def order_votes(frames: Iterable[Sightings], landmarks: Mapping[str, Landmark]) 
     return right, wrong
 
 
+def is_order_right(frames: Iterable[Sightings], landmarks: Mapping[str, Landmark]) -> bool:
+    """Whether three landmarks of one frame clearly stand in the order of the map: bearings are not
+    mirrored."""
+    right, wrong = order_votes(frames, landmarks)
+    return right >= LEAST_CASES and right > 4 * wrong
+
+
 def _area(corners: Sequence[complex]) -> float:
     """Twice the signed area of a triangle (m^2); 0 if it is nearly a line."""
     a, b, c = corners

@@ -12,6 +12,7 @@ from cpcbl_agents.input_diagnosis import motion_causes as motions
 from cpcbl_agents.input_diagnosis.motion_causes import Step
 from cpcbl_agents.input_diagnosis.position_causes import position_cause
 from cpcbl_agents.input_diagnosis.shift_causes import (
+    Shift,
     contradicts_mistakes,
     is_same,
     is_sure,
@@ -362,9 +363,15 @@ def contradicts_mistake(facts: InputFacts) -> bool:
     lost."""
     if not facts.mistake or not _odometry(facts):
         return False
-    frames = [_usable(frame) for frame in facts.long_frames]
-    shift = shift_of(frames, facts.long_steps, facts.landmarks, facts.sensor, facts.wheels)
+    shift = shift_of_frames(facts)
     return shift is not None and contradicts_mistakes(shift)
+
+
+def shift_of_frames(facts: InputFacts, since_ns: int = 0) -> Shift | None:
+    """How landmarks shift in the long window, or since a time."""
+    frames = [_usable(frame) for frame in facts.long_frames if frame.stamp_ns > since_ns]
+    steps = [step for step in facts.long_steps if step.from_ns >= since_ns]
+    return shift_of(frames, steps, facts.landmarks, facts.sensor, facts.wheels)
 
 
 def _shift_of_landmarks(

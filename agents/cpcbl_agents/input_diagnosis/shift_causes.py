@@ -130,10 +130,12 @@ def is_sure(shift: Shift) -> bool:
     return sigma < SURE and is_turn_right and _sigmas_from_good(shift) < NEAR_SIGMAS
 
 
-def contradicts_mistakes(shift: Shift) -> bool:
+def contradicts_mistakes(shift: Shift, is_turn_known: bool = False) -> bool:
     """Whether the shift is that of a good driver, and not that of bearings that are mirrored or off
-    by a quarter or half of a turn, or of ranges in feet."""
-    is_turn_right = abs(shift.turn_scale - 1.0) < 2.0 * SCALE_SIGMA and shift.turn_sigma < SURE
+    by a quarter or half of a turn, or of ranges in feet. `is_turn_known`: whether something else
+    says that bearings are not mirrored, so that the robot need not turn."""
+    is_turn_right = abs(shift.turn_scale - 1.0) < 2.0 * SCALE_SIGMA
+    is_turn_right &= is_turn_known or shift.turn_sigma < SURE
     if not is_turn_right or _sigmas_from_good(shift) > GOOD_SIGMAS:
         return False
     return all(

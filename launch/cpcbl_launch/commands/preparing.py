@@ -12,7 +12,8 @@ from cpcbl_launch.commands import options
 from cpcbl_launch.reporting.files import write_or_reason
 from cpcbl_launch.reporting.tables import plural, table
 from cpcbl_launch.team.checks import warnings
-from cpcbl_launch.team.file import find_team, key_folder
+from cpcbl_launch.team.file import TeamFileError, find_team, key_folder, without_faulty_keys
+from cpcbl_launch.team.units import unit_warnings
 from cpcbl_team.errors import InputError
 
 if TYPE_CHECKING:
@@ -21,7 +22,13 @@ if TYPE_CHECKING:
 
 def check(file: options.Team) -> None:
     """Validate a team file without starting anything."""
-    team = find_team(file)
+    try:
+        team = find_team(file)
+    except TeamFileError:
+        rest = without_faulty_keys(file)  # it may lack much, but its units can be judged
+        for warning in unit_warnings(rest) if rest else ():
+            typer.echo(f"{file}: warning: {warning}", err=True)
+        raise
     marks, walls = len(team.map.landmarks), len(team.map.walls)
     typer.echo(
         f"{file}: good: team {team.name!r}, {plural(len(team.robots), 'robot')}"

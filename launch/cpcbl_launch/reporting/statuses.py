@@ -83,11 +83,13 @@ MOST_PROBLEMS = 100  # of one robot; they may have free names in them
 
 
 class ProblemLog:
-    """The problems of one robot over a run, by its statuses."""
+    """The problems of one robot over a run, by its statuses; also what is not confirmed about its
+    pose at the end."""
 
     def __init__(self) -> None:
         self._texts: dict[str, str] = {}
         self._statuses: Counter[str] = Counter()
+        self._unconfirmed, self._unconfirmed_statuses = "", 0
 
     def add(self, status: Status) -> None:
         """To be called with each status, of which there is one a second."""
@@ -97,12 +99,19 @@ class ProblemLog:
                 continue
             self._texts[what] = text
             self._statuses[what] += 1
+        if not status.lost:
+            self._unconfirmed = status.unconfirmed
+        self._unconfirmed_statuses += bool(status.unconfirmed)
 
     @property
     def reports(self) -> tuple[ProblemReport, ...]:
         """All of them, the longest first."""
         longest = self._statuses.most_common()
-        return tuple(ProblemReport(text=self._texts[w], seconds=float(n)) for w, n in longest)
+        found = [ProblemReport(text=self._texts[w], seconds=float(n)) for w, n in longest]
+        if self._unconfirmed:
+            seconds = float(self._unconfirmed_statuses)
+            found.append(ProblemReport(text=self._unconfirmed, seconds=seconds))
+        return tuple(found)
 
 
 def problem_remarks(robot: str, problems: Iterable[ProblemReport]) -> Iterator[str]:

@@ -19,6 +19,7 @@ from cpcbl_team.errors import InputError
 
 Layer = dict[str, Any]
 MOST_LINES = 20  # of an error
+MOST_ROUNDS = 20  # of removing keys that have faults: what is left may lack something
 
 
 class TeamFileError(InputError):
@@ -107,6 +108,14 @@ def parse_team(text: str, name: str = "team file") -> Team:
     raw = _parse_toml(text, name)
     if faults := table_faults(raw):
         raise TeamFileError.of(name, faults)
+    team = _team_from_tables(raw)
+    if found := list(problems(team)):
+        raise TeamFileError.of(name, found)
+    return team
+
+
+def _team_from_tables(raw: Layer) -> Team:
+    """The team of tables without faults: its layers are merged."""
     tables = {key: value for key, value in raw.items() if key != "types"}
     tables["robots"] = {
         robot: _merge(
@@ -120,9 +129,38 @@ def parse_team(text: str, name: str = "team file") -> Team:
     if "connect" not in raw.get("transport", {}):  # the endpoint that is usual
         usual = team.transport.usual
         team = replace(team, transport=replace(team.transport, connect=usual))
-    if found := list(problems(team)):
-        raise TeamFileError.of(name, found)
     return team
+
+
+def without_faulty_keys(path: Path) -> Team | None:
+    """The team of a file without the keys that have faults, for what else is to be said of it; None
+    if no team is left."""
+    try:
+        raw = _parse_toml(read_text(path), str(path))
+        for _ in range(MOST_ROUNDS):
+            faults = table_faults(raw)
+            if not faults:
+                return _team_from_tables(raw)
+            for fault in faults:
+                _remove_key(raw, fault.key)
+    except TeamFileError:
+        pass
+    return None
+
+
+def _remove_key(raw: Layer, key: str) -> None:
+    """Removes a key, or the table that lacks it."""
+    table, above = raw, list[tuple[Layer, str]]()
+    for part in key.partition("[")[0].split("."):
+        above.append((table, part))
+        if not isinstance(table.get(part), dict):
+            break
+        table = table[part]
+    while above:
+        table, part = above.pop()
+        if part in table:
+            del table[part]
+            return
 
 
 def read_layer(path: Path) -> Layer:

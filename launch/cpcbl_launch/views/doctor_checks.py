@@ -185,7 +185,9 @@ def _health(facts: Facts) -> Iterator[tuple[Level, str, str]]:
         if status.lost:
             remedy = "it needs landmarks or a teammate in sight, or a start"
             yield "warning", f"{name}: is lost ({status.lost})", remedy
-        if not problems and not status.lost:
+        elif status.unconfirmed:
+            yield "warning", f"{name}: {status.unconfirmed}", "docs/refused_inputs.md"
+        if not problems and not status.lost and not status.unconfirmed:
             yield "good", f"{name}: σ {status.position_sigma_m:.3f} m, tier {status.tier}", ""
 
 

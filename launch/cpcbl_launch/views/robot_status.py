@@ -50,6 +50,7 @@ class RobotStatus(msgspec.Struct, frozen=True, kw_only=True):
     heading_sigma_deg: float | None
     tier: int | None
     lost: str
+    unconfirmed: str  # what nothing confirms about its pose, and why; empty if nothing is missing
     problems: tuple[str, ...]
     inputs: tuple[InputStatus, ...]
     counts: dict[str, int]
@@ -81,6 +82,7 @@ def _robot_status(name: str, heard: TeamHeard, is_real: bool) -> RobotStatus:
         heading_sigma_deg=math.degrees(status.heading_sigma_rad) if status else None,
         tier=status.tier if status else None,
         lost=status.lost if status else "",
+        unconfirmed=status.unconfirmed if status else "",
         problems=problems,
         inputs=tuple(_inputs(name, status, heard)),
         counts=dict(sorted(status.counts.items())) if status else {},
@@ -97,7 +99,9 @@ def _state_of(name: str, status: Status | None, heard: TeamHeard, has_problems: 
         return "gone" if name in heard.gone else "waiting"
     if status.lost:
         return "lost"
-    return "problem" if has_problems else "ok"
+    if has_problems:
+        return "problem"
+    return "unconfirmed" if status.unconfirmed else "ok"
 
 
 def _problems(name: str, status: Status | None, heard: TeamHeard, is_real: bool) -> Iterator[str]:
@@ -169,10 +173,19 @@ def team_view(robots: Collection[RobotStatus]) -> RenderableType:
             Text(robot.state, _STYLES[robot.state]),
         )
         lines += [Text(f"{robot.robot}: {problem}", "red") for problem in robot.problems]
+        if robot.unconfirmed:
+            lines.append(Text(f"{robot.robot}: {robot.unconfirmed}", "yellow"))
     return Group(shown, *lines)
 
 
-_STYLES = {"ok": "green", "problem": "yellow", "lost": "red", "gone": "red", "waiting": "yellow"}
+_STYLES = {
+    "ok": "green",
+    "unconfirmed": "yellow",
+    "problem": "yellow",
+    "lost": "red",
+    "gone": "red",
+    "waiting": "yellow",
+}
 
 
 def _words(reasons: dict[str, int]) -> str:
@@ -189,6 +202,8 @@ def _robot_lines(robot: RobotStatus) -> Iterator[RenderableType]:
     yield Text(f"robot {robot.robot}", "bold")
     for problem in robot.problems:
         yield Text(f"  {problem}", "red")
+    if robot.unconfirmed:
+        yield Text(f"  {robot.unconfirmed}", "yellow")
     if robot.tier is not None:
         sigma = f"{number(robot.position_sigma_m)} m, {number(robot.heading_sigma_deg, 1)} deg"
         yield Text(f"  σ {sigma}, tier {robot.tier}")

@@ -29,7 +29,7 @@ from cpcbl_launch.views.live import LiveView
 from cpcbl_launch.views.own_figures import own_figures_table
 from cpcbl_launch.views.traffic_tables import COLUMNS_EXPLAINED, help_traffic_table, limits_text
 from cpcbl_team.tiers import LOWEST_TIER
-from cpcbl_transport.messages import Track
+from cpcbl_transport.messages import Status, Track
 
 NARROW = 61  # columns of a terminal, with which a table does without its less important ones
 WITHOUT = ("before m", "mean m", "max m", "out", "B")
@@ -60,7 +60,9 @@ class LiveTable(LiveView):
     ) -> RenderableType:
         shown = self._table(recorder, processes, elapsed_s)
         lines = [
-            f"{name}: {text}" for name, s in recorder.latest()[1].items() for text in s.problems
+            f"{name}: {text}"
+            for name, s in recorder.latest()[1].items()
+            for text in (*s.problems, *filter(None, [s.unconfirmed]))
         ]
         return Group(shown, *(Text(line, "yellow") for line in lines))
 
@@ -90,8 +92,7 @@ class LiveTable(LiveView):
             pid = str(pids[process]) if process in pids else "down" if name in here else "away"
             status, track = statuses.get(name), tracks.get(name)
             silent_s = self._silent_s(name, track)
-            problems = status is not None and bool(status.problems)
-            state = _state(track, pid, restarts.get(process, 0), silent_s, problems)
+            state = _state(track, status, pid, restarts.get(process, 0), silent_s)
             if status is not None and (text := distrust_text(status.trust)):
                 state.append(f", {text}", "yellow")
             if status is not None and miscalibration_text(status.counts, status.learned):
@@ -114,7 +115,9 @@ class LiveTable(LiveView):
         return shown
 
 
-def _state(track: Track | None, pid: str, restarts: int, silent_s: float, problems: bool) -> Text:
+def _state(
+    track: Track | None, status: Status | None, pid: str, restarts: int, silent_s: float
+) -> Text:
     if pid == "down":
         state = Text("down", style="bold red")
     elif track is None:
@@ -123,8 +126,10 @@ def _state(track: Track | None, pid: str, restarts: int, silent_s: float, proble
         state = Text(f"silent for {silent_s:.0f} s", "bold red")
     elif track.lost:
         state = Text(f"lost: {track.lost}", "bold red")
-    else:  # what the problem is stands below the table
-        state = Text("problem", "yellow") if problems else Text("ok", "green")
+    elif status is not None and (status.problems or status.unconfirmed):  # said below the table
+        state = Text("problem" if status.problems else "unconfirmed", "yellow")
+    else:
+        state = Text("ok", "green")
     return state.append(f" (restarted {restarts})", "yellow") if restarts else state
 
 

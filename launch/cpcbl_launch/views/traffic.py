@@ -122,7 +122,7 @@ def _live_robot(arrivals: Sequence[Arrival], now_s: float) -> LiveRobot:
         heard=tuple(_live_flows(first, last, first.heard, last.heard)),
         spending=summed_spending([last.spending]),
         trust=trust_reports([last]),
-        problems=last.problems,
+        problems=(*last.problems, *filter(None, [last.unconfirmed])),
     )
 
 

@@ -283,9 +283,12 @@ def test_the_status_of_a_robot_has_its_problems() -> None:
 def test_the_table_of_robots_has_the_words_of_the_view() -> None:
     heard = heard_by_team(without("status/r2"), TOKENS, SECONDS)["tests"]
     r1, r2 = robot_statuses(heard, TEAM)
-    bad = replace(r1, robot="r3", state="problem"), replace(r1, robot="r4", state="lost")
+    bad = [replace(r1, robot="r3", state="problem"), replace(r1, robot="r4", state="lost")]
+    bad.append(replace(r1, robot="r5", state="unconfirmed", unconfirmed="it stood"))
     console = Console(width=80, record=True, file=StringIO())
     console.print(team_view([r1, r2, *bad]))
     rows = [line.split() for line in console.export_text().splitlines()]
-    states = {row[0]: row[-1] for row in rows if row and row[0] in ("r1", "r2", "r3", "r4")}
-    assert states == {"r1": "ok", "r2": "waiting", "r3": "problem", "r4": "lost"}
+    states = {row[0]: row[-1] for row in rows if row and row[0] in ("r1", "r2", "r3", "r4", "r5")}
+    due = {"r1": "ok", "r2": "waiting", "r3": "problem", "r4": "lost", "r5": "unconfirmed"}
+    assert states == due
+    assert ["r5:", "it", "stood"] in rows

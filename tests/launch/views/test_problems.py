@@ -17,6 +17,7 @@ from cpcbl_transport import topics
 from cpcbl_transport.memory_bus import MemoryHub
 from cpcbl_transport.messages import InputHealth, Tagged, Track, encode
 
+UNCONFIRMED = "the pose is not confirmed: it stood"
 SILENT = "no odometry on in/r1/odometry for 4 s"
 HEALTH = InputHealth("odometry", 0.0, 5, 100, {"too_late": 3}, 0.5)
 
@@ -69,6 +70,23 @@ def test_a_robot_with_a_problem_is_not_ok_in_the_live_table() -> None:
     assert rows["r1"].endswith("problem")
     assert rows["r2"].endswith("ok")
     assert rows["r1:"] == f"r1: {SILENT}"
+
+
+def test_a_robot_whose_pose_is_not_confirmed_is_not_ok() -> None:
+    table = Table()
+    table.tracks(SECOND, "r1", "r2")
+    for name, unconfirmed in (("r1", UNCONFIRMED), ("r2", "")):
+        table.put(topics.STATUS.at(robot=name), status(name, 1.0, 3, unconfirmed=unconfirmed))
+    rows = table.rows()
+    assert rows["r1"].endswith("unconfirmed")
+    assert rows["r2"].endswith("ok")
+    assert rows["r1:"] == f"r1: {UNCONFIRMED}"
+
+
+def test_a_report_says_what_is_not_confirmed_at_the_end() -> None:
+    not_yet = [status("r1", 1.0 + n, 3, unconfirmed=UNCONFIRMED) for n in range(3)]
+    assert f"Robot r1, for 3 s: {UNCONFIRMED}." in shown(recorded(*not_yet))
+    assert UNCONFIRMED not in shown(recorded(*not_yet, status("r1", 9.0, 3)))
 
 
 def test_a_robot_that_is_silent_is_not_ok_in_the_live_table(

@@ -27,7 +27,7 @@ LEFT_S = 30.0  # a guest that left is shown for so long
 UNHEARD_S = 3.0  # so long after the connection the team should have been heard
 REFUSALS = frozenset([*Refusal, *SightingFault])
 
-State = Literal["ok", "problem", "lost", "gone", "waiting"]
+State = Literal["ok", "unconfirmed", "problem", "lost", "gone", "waiting"]
 Triple = tuple[float, float, float]
 Arrow = tuple[str, str, str, int, float | None]
 """Helper, helped, topic, tier of the helper, messages/s."""
@@ -200,7 +200,10 @@ def state_of(latest: LatestMessages, now_s: float) -> tuple[State, str]:
     if newest.lost:
         return "lost", "; ".join([newest.lost, *getattr(status, "problems", ())[:1]])
     problems = list(_problems(latest))
-    return ("problem", problems[0]) if problems else ("ok", "")
+    if problems:
+        return "problem", problems[0]
+    unconfirmed = status.unconfirmed if status else ""
+    return ("unconfirmed", unconfirmed) if unconfirmed else ("ok", "")
 
 
 def _problems(latest: LatestMessages) -> Iterator[str]:

@@ -87,6 +87,14 @@ def test_a_problem_that_a_robot_tells_is_shown_before_what_is_inferred() -> None
     assert state_of(robot, 10.1) == ("problem", "distrusts west (biased)")
 
 
+def test_a_pose_that_nothing_confirms_is_not_ok() -> None:
+    unconfirmed = "the heading is not confirmed: the robot has not driven so far"
+    robot = latest(arrivals=seen(status("r1", 10.0, 3, unconfirmed=unconfirmed)))
+    assert state_of(robot, 10.1) == ("unconfirmed", unconfirmed)
+    both = status("r1", 10.0, 3, unconfirmed=unconfirmed, problems=("bearings look mirrored",))
+    assert state_of(latest(arrivals=seen(both)), 10.1)[0] == "problem"
+
+
 def test_a_picture_has_the_ellipse_the_error_and_what_is_seen() -> None:
     sightings = Sightings(0, (Sighting("door", 2.0, 0.1), Sighting("wall", None, -1.0)))
     truth = Truth("r1", 1.1, 2.0, 0.5)

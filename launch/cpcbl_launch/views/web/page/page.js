@@ -138,10 +138,11 @@ function colour() {
 }
 
 function summary() {
-  const count = { ok: 0, problem: 0, lost: 0, gone: 0, waiting: 0 };
+  const count = { ok: 0, unconfirmed: 0, problem: 0, lost: 0, gone: 0, waiting: 0 };
   for (const { state } of robots.values()) count[state ?? "waiting"] += 1;
   const total = robots.size, words = [`${total} ${total === 1 ? "robot" : "robots"}`];
   if (count.problem) words.push(`${count.problem} with a problem`);
+  if (count.unconfirmed) words.push(`${count.unconfirmed} unconfirmed`);
   if (count.lost) words.push(`${count.lost} lost`);
   if (count.gone) words.push(`${count.gone} gone`);
   if (count.waiting) words.push(`${count.waiting} waiting`);

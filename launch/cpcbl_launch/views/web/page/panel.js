@@ -1,6 +1,6 @@
 // The table of all robots, which also serves screen readers, and all of the chosen one.
 const $ = (id) => document.getElementById(id);
-const WORDS = { ok: "ok", problem: "problem", lost: "lost", gone: "gone", waiting: "waiting" };
+const WORDS = { ok: "ok", unconfirmed: "unconfirmed", problem: "problem", lost: "lost", gone: "gone", waiting: "waiting" };
 const number = (value, digits = 3) => (value == null ? "–" : value.toFixed(digits));
 const plural = (n, what) => `${n} ${what}${n === 1 ? "" : "s"}`;
 const words = (name) => name.replaceAll("_", " ");

@@ -1,0 +1,146 @@
+"""A robot that found its pose without a known start says what nothing confirms about it."""
+
+import math
+
+import pytest
+from support.drivers import DrivenRobot, World
+from support.mistake_rows import ODOMETRY, SEEN
+from support.mistakes import bearings
+
+from cpcbl_team.config import OdometrySettings, Start
+from cpcbl_team.geometry import Pose2, wrap_angle
+from cpcbl_transport.decoding import Subscriber
+from cpcbl_transport.messages import Pose
+
+TWO = {"p": (3.2, 2.1), "q": (4.1, -1.3)}
+THREE = {"p": (3.2, 2.1), "q": (-1.4, 3.3), "s": (2.5, -2.7)}
+START = Pose2(0.4, -0.3, 0.6)
+UNKNOWN = {"start": None}
+ARC = World(lambda t: (0.45, 0.25), TWO, START, settings=UNKNOWN, seed=21)
+SHUTTLE = World(
+    lambda t: (0.15 * math.cos(0.6 * t), 0.3 * math.cos(0.6 * t)),
+    THREE,
+    START,
+    settings=UNKNOWN,
+    seed=22,
+)
+SPIN = World(lambda t: (0.0, -0.35), THREE, START, settings=UNKNOWN, seed=23)
+STAND = SPIN._replace(drive=lambda t: (0.0, 0.0), places=TWO)
+OF_BEARINGS = ["to the right", "from the camera's x", "backwards", "from x of the field"]
+OF_TURNS = ["turns in degrees", "mirrored", "headings"]
+
+
+def is_wrong(robot: DrivenRobot) -> bool:
+    """Whether the true pose is far from the estimate, beside its sigmas."""
+    estimate = robot.node.robot.filter.timeline.state.estimate
+    (x, y, heading), c = estimate.pose, estimate.covariance
+    off_m = math.hypot(robot.pose.x - x, robot.pose.y - y)
+    off_rad = abs(wrap_angle(robot.pose.heading - heading))
+    return (
+        off_m > 3.0 * math.sqrt(c.xx + c.yy) + 0.3 or off_rad > 3.0 * math.sqrt(max(c.hh, 0)) + 0.3
+    )
+
+
+@pytest.mark.parametrize("mistake", [*OF_BEARINGS, *OF_TURNS])
+@pytest.mark.parametrize("world", [ARC, SPIN, STAND], ids=["arc", "spin", "stand"])
+def test_no_wrong_pose_is_ok(world: World, mistake: str) -> None:
+    robot, change = DrivenRobot(world), {**SEEN, **ODOMETRY}[mistake].make()
+    robot.run(1.1, change)
+    for _ in range(14):
+        robot.run(0.5, change)
+        status = robot.statuses[-1]
+        is_ok = not (status.lost or status.problems or status.unconfirmed)
+        assert not (is_ok and is_wrong(robot)), f"{status.stamp_ns}"
+
+
+@pytest.mark.parametrize("world", [ARC, SHUTTLE], ids=["arc", "shuttle"])
+def test_motion_confirms_the_pose_of_a_good_driver(world: World) -> None:
+    robot = DrivenRobot(world)
+    robot.run(2.1)
+    assert not robot.statuses[-1].lost  # the pose is there, and used
+    assert "is not confirmed" in robot.statuses[-1].unconfirmed
+    robot.run(12.0)
+    assert {s.unconfirmed for s in robot.statuses[-4:]} == {""}
+    assert {text for s in robot.statuses for text in s.problems} == set()
+
+
+def test_turning_on_the_spot_confirms_no_heading() -> None:
+    robot, quarter_off = DrivenRobot(SPIN), bearings(lambda b: b + 0.5 * math.pi)
+    robot.run(20.1, quarter_off)
+    status = robot.statuses[-1]
+    assert not status.lost
+    assert not status.problems
+    assert status.unconfirmed == (
+        "the heading is not confirmed: the robot has only turned on the spot so far, and bearings"
+        " that are off by an angle would look the same; drive it past landmarks, or state its start"
+    )
+    assert is_wrong(robot)
+
+
+def test_a_robot_that_stands_before_two_landmarks_may_be_mirrored() -> None:
+    robot = DrivenRobot(STAND)
+    robot.run(5.1)
+    assert "the pose is not confirmed: the robot has not driven" in robot.statuses[-1].unconfirmed
+
+
+def test_a_known_start_needs_no_confirmation() -> None:
+    for settings in ({}, {"start": Start(x_m=START.x, y_m=START.y, heading_deg=34.4)}):
+        robot = DrivenRobot(STAND._replace(settings=settings))
+        robot.run(3.1)
+        assert {s.unconfirmed for s in robot.statuses} == {""}
+
+
+@pytest.mark.parametrize(("places", "said"), [(THREE, ""), (TWO, "fewer than three landmarks")])
+def test_a_robot_that_never_moves_is_confirmed_by_the_order_of_three_landmarks(
+    places: dict[str, tuple[float, float]], said: str
+) -> None:
+    settings = {**UNKNOWN, "odometry": OdometrySettings(moves=False)}
+    robot = DrivenRobot(STAND._replace(places=places, odometry_hz=0.0, settings=settings))
+    robot.run(4.1)
+    assert not robot.statuses[-1].lost
+    assert said in robot.statuses[-1].unconfirmed
+    assert bool(said) is bool(robot.statuses[-1].unconfirmed)
+
+
+def test_after_a_mistake_only_what_came_since_confirms() -> None:
+    robot = DrivenRobot(ARC)
+    robot.run(6.1, SEEN["from the camera's x"].make())
+    assert robot.statuses[-1].lost or robot.statuses[-1].problems
+    robot.run(30.0)
+    assert not robot.statuses[-1].lost
+    assert robot.statuses[-1].problems == ()
+    assert robot.statuses[-1].unconfirmed == ""
+
+
+def test_a_pose_that_was_found_elsewhere_is_to_be_confirmed_again() -> None:
+    still = STAND._replace(places=THREE, settings={}, start=Pose2(0.0, 0.0, 0.0))
+    robot = DrivenRobot(still)
+    robot.run(5.1)
+    robot.pose = Pose2(1.5, -1.0, 2.0)  # it is carried
+    robot.run(20.0)
+    status = robot.statuses[-1]
+    assert not status.lost
+    assert "heading is not confirmed" in status.unconfirmed
+
+
+def test_the_pose_says_so_too() -> None:
+    robot, found = DrivenRobot(SPIN), list[Pose]()
+    Subscriber(robot.hub.session(), Pose, lambda r: found.append(r.message), robot="r1")
+    robot.run(5.0)
+    assert found[-1].lost == ""
+    assert {pose.unconfirmed for pose in found if pose.lost} <= {""}
+    assert all(pose.unconfirmed for pose in found if not pose.lost)
+
+
+def test_many_rejected_measurements_are_said_before_the_robot_is_lost() -> None:
+    weave = World(
+        lambda t: (0.15 * math.cos(0.6 * t), 0.3 * math.cos(0.6 * t)), THREE, START, seed=24
+    )
+    robot = DrivenRobot(weave)
+    robot.run(10.1)
+    assert {s.unconfirmed for s in robot.statuses} == {""}
+    before = len(robot.statuses)
+    robot.run(6.0, ODOMETRY["headings in degrees"].make())
+    said = [s for s in robot.statuses[before:] if s.unconfirmed]
+    assert "the robot rejects" in said[0].unconfirmed
+    assert not any(s.lost for s in said)
