@@ -142,8 +142,8 @@ class FilteredOffset(NamedTuple):
             off = residual - row[0] * x - row[1] * y - row[2] * heading
             cost += k * off * off
             x, y, heading = x + k * off * px, y + k * off * py, heading + k * off * ph
-            gained = Covariance3(px * px, px * py, py * py, px * ph, py * ph, ph * ph)
-            covariance = covariance.plus(gained, -k)
+            gained = px * px, px * py, py * py, px * ph, py * ph, ph * ph
+            covariance = covariance.plus(new(Covariance3, gained), -k)
         return FilteredOffset(covariance, (x, y, heading), cost)
 
 

@@ -32,7 +32,7 @@ class Pose2(NamedTuple):
     def __matmul__(self, b_from_c: "Pose2") -> "Pose2":
         """`a_from_b @ b_from_c` is `a_from_c`."""
         x, y = self.transform(b_from_c.x, b_from_c.y)
-        return Pose2(x, y, wrap_angle(self.heading + b_from_c.heading))
+        return new(Pose2, (x, y, wrap_angle(self.heading + b_from_c.heading)))
 
     def transform(self, x: float, y: float) -> tuple[float, float]:
         """The point (x, y) of frame b, in frame a."""

@@ -39,10 +39,11 @@ def test_markers_of_a_bad_camera_are_recalled_and_none_is_wrong(kind: str) -> No
     assert printed([score], ()).row_count == 1
 
 
-def test_no_marker_is_in_pictures_without_one() -> None:
+@pytest.mark.parametrize("frames", [16, pytest.param(40, marks=pytest.mark.long)])
+def test_no_marker_is_in_pictures_without_one(frames: int) -> None:
     """The families whose codes are the shortest are the likeliest to be seen where there are none;
     `make bench-degraded` has natural pictures."""
     backgrounds = textures(12, np.random.default_rng(4))
     families: tuple[MarkerFamily, ...] = ("aruco_4x4_50", "apriltag_16h5")
     for family in families:
-        assert false_markers(family, backgrounds, 40, seed=1) == 0
+        assert false_markers(family, backgrounds, frames, seed=1) == 0

@@ -26,6 +26,7 @@ from support.core import (
     sensor_noise,
     steered,
 )
+from support.sweeps import over_seeds
 
 from cpcbl_launch.reporting.metrics import Samples, Score, score
 from cpcbl_team.config import (
@@ -72,8 +73,8 @@ def samples(robot: Localizer, perceive: Perceive, seed: int) -> tuple[Matrix, Ma
     return np.array(estimates), np.array(truths), np.array(covariances)
 
 
-def scored(robot: Localizer, perceive: Perceive, seeds: int = 14) -> Score:
-    runs = [samples(robot, perceive, seed) for seed in range(seeds)]
+def scored(robot: Localizer, perceive: Perceive, seeds: range) -> Score:
+    runs = [samples(robot, perceive, seed) for seed in seeds]
     estimate, truth, covariance = (np.concatenate(parts) for parts in zip(*runs, strict=True))
     return score(Samples(estimate, truth, covariance))
 
@@ -114,6 +115,7 @@ def an_observer(sensor_m: float, observer_m: float) -> Perceive:
     return perceive
 
 
+@over_seeds(6, 14)
 @pytest.mark.parametrize(
     "sensor",
     [
@@ -123,9 +125,11 @@ def an_observer(sensor_m: float, observer_m: float) -> Perceive:
     ids=["5 % and 5 deg", "3 % and 2 deg"],
 )
 @pytest.mark.parametrize("variant", PROBABILISTIC)
-def test_landmarks_give_the_error_that_is_claimed(variant: Variant, sensor: SensorSettings) -> None:
+def test_landmarks_give_the_error_that_is_claimed(
+    variant: Variant, sensor: SensorSettings, seeds: range
+) -> None:
     robot = localizer(variant, start=START, sensor=sensor, odometry=ODOMETRY)
-    found = scored(robot, landmarks(sensor))
+    found = scored(robot, landmarks(sensor), seeds)
     assert found.inside_3_sigma is not None
     assert found.nees is not None
     assert found.inside_3_sigma >= 0.98
@@ -163,13 +167,14 @@ def test_correlated_errors_are_claimed_as_such_where_their_time_is_known() -> No
     """Three degrees of freedom, a hundred seeds: 95 % of the means lie within 3 +- 0.48."""
     seeds = range(100)
     assert np.mean([of_a_standing_robot(FADE_S, s) for s in seeds]) == pytest.approx(3.0, abs=0.48)
-    assert np.mean([of_a_standing_robot(0.0, s) for s in range(20)]) > 15.0
+    assert np.mean([of_a_standing_robot(0.0, s) for s in range(10)]) > 15.0
 
 
+@over_seeds(3, 6)
 @pytest.mark.parametrize(("fusion", "honest"), [("split-ci", True), ("naive", False)])
 @pytest.mark.parametrize("variant", PROBABILISTIC)
 def test_an_observer_that_is_off_is_not_believed_more_for_repeating_itself(
-    variant: Variant, fusion: Fusion, honest: bool
+    variant: Variant, fusion: Fusion, honest: bool, seeds: range
 ) -> None:
     """Resolution c; only fixes, no landmarks."""
     robot = localizer(
@@ -179,6 +184,6 @@ def test_an_observer_that_is_off_is_not_believed_more_for_repeating_itself(
         odometry=ODOMETRY,
         collaboration=CollaborationSettings(fusion=fusion),
     )
-    found = scored(robot, an_observer(sensor_m=0.05, observer_m=0.1), seeds=6)
+    found = scored(robot, an_observer(sensor_m=0.05, observer_m=0.1), seeds)
     assert found.inside_3_sigma is not None
     assert (found.inside_3_sigma >= 0.98) is honest

@@ -28,6 +28,7 @@ from support.core import (
     position_error,
     state_at,
 )
+from support.sweeps import over_seeds
 
 from cpcbl_team.config import (
     CollaborationSettings,
@@ -292,17 +293,22 @@ def _driven_on(
 
 
 @cache
-def runs(variant: Variant, fusion: Fusion, headed: bool, off_m: float, off_deg: float) -> list[Run]:
+def runs(
+    variant: Variant, fusion: Fusion, headed: bool, off_m: float, off_deg: float, seeds: range
+) -> list[Run]:
     rules = CollaborationSettings(fusion=fusion)
     robot = localizer(variant, Field(), start=START, odometry=ODOMETRY, collaboration=rules)
-    return [blind(robot, seed, headed, off_m, off_deg) for seed in range(40)]
+    return [blind(robot, seed, headed, off_m, off_deg) for seed in seeds]
 
 
+@over_seeds(16, 40)
 @variants
-def test_fixes_with_a_heading_improve_the_heading_of_a_blind_robot(variant: Variant) -> None:
+def test_fixes_with_a_heading_improve_the_heading_of_a_blind_robot(
+    variant: Variant, seeds: range
+) -> None:
     """The same noise with and without; in the mean of the runs, and in most of them."""
     told, untold = (
-        np.array([run.heading_rms_deg for run in runs(variant, "split-ci", headed, 0.02, 1.0)])
+        np.array([r.heading_rms_deg for r in runs(variant, "split-ci", headed, 0.02, 1.0, seeds)])
         for headed in (True, False)
     )
     assert np.mean(told) < 0.8 * np.mean(untold)
@@ -321,7 +327,7 @@ def test_an_observer_whose_heading_is_off_gets_no_more_weight_than_due(
 ) -> None:
     """4 degrees, in what it says of the position and of the heading alike. Of the circle only the
     heading: what it makes of such an observer's thin ellipses claims too much even without one."""
-    told = runs(variant, fusion, True, 0.02, 4.0)
+    told = runs(variant, fusion, True, 0.02, 4.0, range(40))
     heading = [np.mean(r.errors[:, 2] ** 2 / r.covariances[:, 2, 2]) for r in told]
     assert bool(np.mean(heading) <= MOST_HEADING_NEES) is honest
     if variant == "circular":

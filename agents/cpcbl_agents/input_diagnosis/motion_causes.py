@@ -265,8 +265,10 @@ def resightings(
             waiting = begun.setdefault(seen.id, [])
             for since_ns, before in waiting[:]:
                 gap_ns = frame.stamp_ns - since_ns
-                changed = abs(place - before) > NOTABLE * max(abs(place), abs(before))
-                if gap_ns >= (least_ns if changed else most_ns):
+                if gap_ns >= most_ns or (
+                    gap_ns >= least_ns
+                    and abs(place - before) > NOTABLE * max(abs(place), abs(before))
+                ):
                     yield Resighting(since_ns, frame.stamp_ns, before, place)
                     waiting.remove((since_ns, before))
             if not waiting or frame.stamp_ns - waiting[-1][0] >= SPACING_NS:

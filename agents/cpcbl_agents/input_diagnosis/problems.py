@@ -390,9 +390,12 @@ def _shift_of_landmarks(
 
 def _usable(frame: Sightings) -> Sightings:
     """The frame without sightings whose numbers cannot be used."""
-    usable = tuple(
+    usable = [
         s
         for s in frame.sightings
-        if abs(s.bearing_rad or 0.0) <= LARGEST_ANGLE and abs(s.range_m or 0.0) <= LARGEST_NUMBER
-    )
-    return Sightings(frame.stamp_ns, usable)
+        if -LARGEST_ANGLE <= (s.bearing_rad or 0.0) <= LARGEST_ANGLE
+        and -LARGEST_NUMBER <= (s.range_m or 0.0) <= LARGEST_NUMBER
+    ]
+    if len(usable) == len(frame.sightings):
+        return frame
+    return Sightings(frame.stamp_ns, tuple(usable))

@@ -83,12 +83,44 @@ class Shift(NamedTuple):
 
     def sigmas_from(self, gain: complex, share: float = 0.0) -> float:
         """How far the gain is from another one, which may itself be off by a share of it."""
+        return self._sigmas_from(gain, share, self._sums_along())
+
+    def sigmas_from_good(self) -> float:
+        """How far the shift is from that of a driver whose scale and bearings are only not
+        calibrated: the least over a grid of both, whose own sigmas count too."""
+        sums, least = self._sums_along(), math.inf
+        for far, gain in _GOOD_GAINS:
+            if far >= least:
+                break  # no later one is nearer
+            least = min(least, math.hypot(self._sigmas_from(gain, AGREE, sums), far))
+        return least
+
+    def _sums_along(self) -> tuple[float, float, float]:
+        """The variances xx, yy, xy of what is less well known in some directions."""
+        xx = sum(a.real * a.real for a in self.along)
+        yy = sum(a.imag * a.imag for a in self.along)
+        return xx, yy, sum(a.real * a.imag for a in self.along)
+
+    def _sigmas_from(self, gain: complex, share: float, sums: tuple[float, float, float]) -> float:
         off, variance = self.gain - gain, self.variance + abs(share * gain) ** 2
-        xx = variance + sum(a.real * a.real for a in self.along)
-        yy = variance + sum(a.imag * a.imag for a in self.along)
-        xy = sum(a.real * a.imag for a in self.along)
+        xx, yy, xy = variance + sums[0], variance + sums[1], sums[2]
         square = yy * off.real**2 - 2.0 * xy * off.real * off.imag + xx * off.imag**2
         return math.sqrt(square / (xx * yy - xy * xy))
+
+
+_GRID = [0.6 * i for i in range(-8, 9)]  # sigmas: AGREE is more than what is between
+_GOOD_GAINS = sorted(
+    (
+        (
+            math.hypot(log_scale, bias),
+            cmath.rect(math.exp(log_scale * SCALE_SIGMA), bias * BIAS_SIGMA_RAD),
+        )
+        for log_scale in _GRID
+        for bias in _GRID
+    ),
+    key=lambda good: good[0],
+)
+"""The gains of drivers without calibration, and how many sigmas each is off, nearest first."""
 
 
 def shift_of(
@@ -114,7 +146,7 @@ def shift_cause(shift: Shift, steps: Sequence[Step]) -> str:
     off = abs(shift.turn_scale - 1.0)
     if off > SIGMAS * math.hypot(shift.turn_sigma, SCALE_SIGMA * min(off, 1.0)):
         return _of_turns(shift) if shift.most_turn_rad < MOST_TURN_RAD else ""
-    return _of_gain(shift, steps) if _sigmas_from_good(shift) > SIGMAS else ""
+    return _of_gain(shift, steps) if shift.sigmas_from_good() > SIGMAS else ""
 
 
 def is_same(shift: Shift, late: Shift | None) -> bool:
@@ -127,7 +159,7 @@ def is_sure(shift: Shift) -> bool:
     variance = shift.variance + sum(abs(a) ** 2 for a in shift.along)
     sigma = max(math.sqrt(variance), shift.turn_sigma)
     is_turn_right = abs(shift.turn_scale - 1.0) < 2.0 * SCALE_SIGMA
-    return sigma < SURE and is_turn_right and _sigmas_from_good(shift) < NEAR_SIGMAS
+    return sigma < SURE and is_turn_right and shift.sigmas_from_good() < NEAR_SIGMAS
 
 
 def contradicts_mistakes(shift: Shift, is_turn_known: bool = False) -> bool:
@@ -136,28 +168,11 @@ def contradicts_mistakes(shift: Shift, is_turn_known: bool = False) -> bool:
     says that bearings are not mirrored, so that the robot need not turn."""
     is_turn_right = abs(shift.turn_scale - 1.0) < 2.0 * SCALE_SIGMA
     is_turn_right &= is_turn_known or shift.turn_sigma < SURE
-    if not is_turn_right or _sigmas_from_good(shift) > GOOD_SIGMAS:
+    if not is_turn_right or shift.sigmas_from_good() > GOOD_SIGMAS:
         return False
     return all(
         shift.sigmas_from(gain, AGREE) > NEAR_SIGMAS for gain in (1j, -1j, -1.0, 1.0 / FOOT_M)
     )
-
-
-def _sigmas_from_good(shift: Shift) -> float:
-    """How far a shift is from that of a driver whose scale and bearings are only not calibrated."""
-    return min(
-        math.hypot(
-            shift.sigmas_from(
-                cmath.rect(math.exp(log_scale * SCALE_SIGMA), bias * BIAS_SIGMA_RAD), AGREE
-            ),
-            math.hypot(log_scale, bias),
-        )
-        for log_scale in _GRID
-        for bias in _GRID
-    )
-
-
-_GRID = [0.6 * i for i in range(-8, 9)]  # sigmas: AGREE is more than what is between
 
 
 def _of_turns(shift: Shift) -> str:
@@ -209,11 +224,12 @@ def _points(
     bins: dict[str, dict[int, list[tuple[complex, complex, complex, float]]]] = {}
     poses = poses_at(steps, [frame.stamp_ns for frame in frames])
     for frame, (where, heading) in zip(frames, poses, strict=True):
+        number, ahead = frame.stamp_ns // BIN_NS, cmath.rect(1.0, heading)
         for seen in frame.sightings:
             place = place_of(seen) if seen.range_m is not None and seen.id in marks else None
             if place is not None:
-                own = bins.setdefault(seen.id, {}).setdefault(frame.stamp_ns // BIN_NS, [])
-                own.append((place, place * cmath.rect(1.0, heading), where, heading))
+                own = bins.setdefault(seen.id, {}).setdefault(number, [])
+                own.append((place, place * ahead, where, heading))
     share = math.hypot(sensor.range_share, sensor.bearing_sigma_rad)
     for name, own_bins in bins.items():
         if len(own_bins) < LEAST_OF_ONE or max(own_bins) - min(own_bins) < LEAST_SPAN_NS // BIN_NS:

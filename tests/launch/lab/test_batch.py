@@ -8,6 +8,7 @@ import pytest
 from support.logs import log_team, write_log
 from support.noisy_logs import ROBOTS, figure, noisy_log, rewrite_table, with_start_poses
 from support.processes import command_line
+from support.sweeps import over_seeds
 
 from cpcbl_launch.commands.old_forms import with_values
 from cpcbl_launch.lab.baselines import baseline_inputs, run_ekf
@@ -38,10 +39,11 @@ def test_the_batch_has_no_error_without_noise(tmp_path: Path) -> None:
         assert robot.position_max_m == pytest.approx(0.0, abs=1e-6)
 
 
-def test_the_batch_is_the_ceiling_and_consistent(tmp_path: Path) -> None:
+@over_seeds(2, 5)
+def test_the_batch_is_the_ceiling_and_consistent(tmp_path: Path, seeds: range) -> None:
     """It knows the future: better than the centralized EKF in each run, with a NEES of 2."""
     batches = []
-    for seed in range(5):
+    for seed in seeds:
         (tmp_path / str(seed)).mkdir()
         logged = noisy_log(tmp_path / str(seed), seed, 20.0)
         batches.append(batch_of(logged))

@@ -21,7 +21,7 @@ def test_one_robot_in_five_sees_landmarks(size: int) -> None:
 def test_a_curve_of_simulated_teams_has_the_means_of_its_seeds(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(budget, "SIMULATED_S", 30.0)
+    monkeypatch.setattr(budget, "SIMULATED_S", 15.0)
     by_setting = {(case.series, case.setting): case for case in budget.cases()}
     runs = budget.simulated_runs(5, 2)
     tight, generous = (

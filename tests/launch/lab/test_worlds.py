@@ -4,6 +4,7 @@ import math
 
 import pytest
 from support.processes import command_line
+from support.sweeps import over_seeds
 
 from cpcbl_launch.lab.experiments import world_list
 from cpcbl_launch.lab.experiments.runs import map_in_processes
@@ -117,10 +118,11 @@ def figures(names: tuple[str, ...], variants: tuple[str, ...], seeds: int) -> di
     }
 
 
+@over_seeds(3, 5)
 @pytest.mark.parametrize("world", QUICK)
-def test_a_robot_knows_how_far_it_errs_outside_the_usual_case(world: str) -> None:
+def test_a_robot_knows_how_far_it_errs_outside_the_usual_case(world: str, seeds: range) -> None:
     """A few seeds of the worlds in which it once did not; the same noise every time."""
-    found = figures((world,), ("joint",), 5)
+    found = figures((world,), ("joint",), len(seeds))
     expected = ("always lost",) if world == "carried away, 1 landmark" else CONSISTENT
     assert {name for name, word in found.items() if word not in expected} == set()
 
