@@ -37,7 +37,7 @@ def recent_senders(
 
 def voting_means(senders: SenderRecords, now_ns: int, name: str, of: int) -> dict[str, MeanOffset]:
     """The precise means (`of`: FAST or SLOW) of the recent sources but `name`. Guests have no vote
-    beside two robots of the team."""
+    beside two robots of the team, of which `name` may be one."""
     means = {
         other: mean
         for other, r in recent_senders(senders, now_ns, name)
@@ -45,8 +45,8 @@ def voting_means(senders: SenderRecords, now_ns: int, name: str, of: int) -> dic
         and mean.is_precise
         and now_ns - r.offsets[of].stamp_ns <= RECENT_NS
     }
-    guests = {other for other in means if senders[other].is_guest}
-    if len(means.keys() - guests - {OWN_SENSORS}) < 2:
+    guests = {sender for sender in (*means, name) if senders[sender].is_guest}
+    if len({*means, name} - guests - {OWN_SENSORS}) < 2:
         return means
     return {other: mean for other, mean in means.items() if other not in guests}
 
