@@ -19,9 +19,11 @@ from cpcbl_team.mean_headings import MOST_SIGMA, MeanTurn
 
 FAST_NS: Final = 1_500_000_000  # time constants with which reports fade: a fast drift shows sooner
 SLOW_NS: Final = 6_000_000_000  # in the mean of a short time, a slow one in that of a long time
+FAST: Final = 0  # places of both means in a record
+SLOW: Final = 1
 LEAST_REPORTS: Final = 5.0  # with fewer, fading, a source has no mean
 MOST_SIGMA_M: Final = 0.15  # a source whose mean is less certain has no vote
-SURE_SIGMA_M: Final = 0.08  # own sensors that are less certain convict nobody alone
+SURE_SIGMA_M: Final = 0.08  # own sensors that are less certain convict and doubt nobody alone
 FAST_COMMON_M: Final = 0.01
 SLOW_COMMON_M: Final = 0.01
 """Sigmas of what two correct sources may disagree by for ever: calibration, map, and the error of
@@ -33,8 +35,8 @@ LEAD: Final = 7.0
 """Of two that contradict each other one is clearly nearer to a third source by this difference of
 their chi-squares."""
 NEARER: Final = 2.0
-"""By so much a contested source must be nearer to the robot's own sensors than its rivals, until
-these decide, to be used."""
+"""Of two senders one is probably nearer to the robot's own sensors by this difference of their
+chi-squares."""
 HEADING_VARIANCE: Final = math.radians(5.0) ** 2
 """rad^2: the heading of an estimate that was led astray may be wrong by more than its variance."""
 NOTHING: Final = Covariance2(0.0, 0.0, 0.0)
@@ -175,9 +177,7 @@ class Comparison(NamedTuple):
     """It contradicts others, and there is no majority for either side."""
     is_confirmed: bool = False
     """At least one other source agrees, and no majority contradicts."""
-    is_left_out: bool = (
-        False  # the robot has sensors of its own, and need not use it while contested
-    )
+    is_left_out: bool = False  # it is contested, and a rival is nearer to the robot's own sensors
 
 
 def both(fast: Comparison, slow: Comparison) -> Comparison:
@@ -196,19 +196,25 @@ def both(fast: Comparison, slow: Comparison) -> Comparison:
 
 def compared_with_own_sensors(mean: MeanOffset, own: MeanOffset, others: Means) -> Comparison:
     """A sender beside the robot's own sensors, which outweigh any number of others. Where this one
-    and another contradict each other, they decide by which of both is clearly nearer to theirs. A
-    contested sender is used while it is nearer than all its rivals."""
+    and another contradict each other, they decide by which of both is clearly nearer to theirs.
+
+    The bias of a sender is its distance from its doubters: own sensors that are sure, and every
+    other sender that is not clearly farther from these. How many others agree with it does not
+    matter. A contested sender is left out if a rival is nearer to the own sensors.
+    """
     here = disagreement(mean, own)
-    rivals = [other for other in others.values() if disagreement(mean, other) > CONFLICT]
-    there = [disagreement(rival, own) for rival in rivals]
-    bias = bias_variance(mean, own)
-    is_refuted = here > CONFLICT and own.is_within(SURE_SIGMA_M)
-    if is_refuted or any(here - z > LEAD for z in there):
+    distances = [(other, disagreement(other, own)) for other in others.values()]
+    rivals = [there for other, there in distances if disagreement(mean, other) > CONFLICT]
+    doubters = [other for other, there in distances if there - here <= NEARER]
+    is_sure = own.is_within(SURE_SIGMA_M)
+    if is_sure:
+        doubters.append(own)
+    bias = max((bias_variance(mean, doubter) for doubter in doubters), default=0.0)
+    is_refuted = is_sure and here > CONFLICT
+    if is_refuted or any(here - there > LEAD for there in rivals):
         return Comparison(bias, is_wrong=True)
-    is_contested = any(z - here <= LEAD for z in there)
-    is_left_out = any(z - here <= NEARER for z in there)
-    if not rivals:
-        bias = max(bias, compared_with_majority(mean, others).bias_variance)
+    is_contested = any(there - here <= LEAD for there in rivals)
+    is_left_out = any(here - there > NEARER for there in rivals)
     return Comparison(bias, False, is_contested, not is_contested, is_left_out)
 
 

@@ -11,6 +11,8 @@ from msgspec.structs import replace
 
 from cpcbl_team.mean_headings import NO_TURNS, FadingTurns, MeanTurn, contradicting
 from cpcbl_team.mean_offsets import (
+    FAST,
+    SLOW,
     Comparison,
     MeanOffset,
     both,
@@ -34,8 +36,8 @@ def recent_senders(
 
 
 def voting_means(senders: SenderRecords, now_ns: int, name: str, of: int) -> dict[str, MeanOffset]:
-    """The precise fast (0) or slow (1) means of the recent sources but `name`. Guests have no vote
-    beside two robots of the team."""
+    """The precise means (`of`: FAST or SLOW) of the recent sources but `name`. Guests have no vote
+    beside two robots of the team, of which `name` may be one."""
     means = {
         other: mean
         for other, r in recent_senders(senders, now_ns, name)
@@ -43,15 +45,15 @@ def voting_means(senders: SenderRecords, now_ns: int, name: str, of: int) -> dic
         and mean.is_precise
         and now_ns - r.offsets[of].stamp_ns <= RECENT_NS
     }
-    guests = {other for other in means if senders[other].is_guest}
-    if len(means.keys() - guests - {OWN_SENSORS}) < 2:
+    guests = {sender for sender in (*means, name) if senders[sender].is_guest}
+    if len({*means, name} - guests - {OWN_SENSORS}) < 2:
         return means
     return {other: mean for other, mean in means.items() if other not in guests}
 
 
 def compare(senders: SenderRecords, name: str, now_ns: int) -> Comparison | None:
     """The result of test 3; None while the sender has no recent mean that is precise."""
-    fast, slow = (_comparison_of(senders, name, now_ns, of) for of in (0, 1))
+    fast, slow = (_comparison_of(senders, name, now_ns, of) for of in (FAST, SLOW))
     found = both(fast, slow) if fast is not None and slow is not None else fast or slow
     if wrong_turn(senders, name, now_ns) is None:
         return found
@@ -59,7 +61,7 @@ def compare(senders: SenderRecords, name: str, now_ns: int) -> Comparison | None
 
 
 def _comparison_of(senders: SenderRecords, name: str, now_ns: int, of: int) -> Comparison | None:
-    """The result of test 3 with the fast (0) or slow (1) mean of a sender."""
+    """The result of test 3 with one mean of a sender (`of`: FAST or SLOW)."""
     record, mean = senders[name], senders[name].means[of]
     if record.offsets[of].stamp_ns != now_ns or mean is None or not mean.is_precise:
         return None

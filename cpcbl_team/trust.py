@@ -21,7 +21,7 @@ from typing import Final, NamedTuple
 from msgspec.structs import replace
 
 from cpcbl_team.config import TrustSettings
-from cpcbl_team.mean_offsets import Comparison, disagreement
+from cpcbl_team.mean_offsets import FAST, Comparison, disagreement
 from cpcbl_team.sender_comparisons import (
     OWN_SENSORS,
     RECENT_NS,
@@ -156,7 +156,7 @@ def _quarantine_by_mean(senders: SenderRecords, name: str, now_ns: int) -> Trust
         return TrustDecision(
             changed, False, "quarantined", names, estimate_error_rad=abs(right_turn.rad)
         )
-    mean, means = senders[name].means[0], voting_means(senders, now_ns, name, 0)
+    mean, means = senders[name].means[FAST], voting_means(senders, now_ns, name, FAST)
     if mean is None or not means:
         return TrustDecision(senders, False)
     own = means.get(OWN_SENSORS)
@@ -205,7 +205,7 @@ def _decide_dispute(
 
 def _contested_m(record: SenderRecord) -> float:
     """How far from the estimate a contested sender says that the robot is."""
-    mean = record.means[0]
+    mean = record.means[FAST]
     return 0.0 if mean is None else mean.length_m
 
 

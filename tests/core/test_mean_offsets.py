@@ -173,8 +173,23 @@ def test_vague_own_sensors_convict_only_one_of_two_that_contradict_each_other() 
     assert compared_with_own_sensors(at(0.6), own, {"a": at(0.0)}).is_wrong
     undecided = compared_with_own_sensors(at(0.1), own, {"a": at(0.0)})
     assert undecided.is_contested
-    assert undecided.is_left_out
+    assert not undecided.is_left_out  # its bias bounds its weight
+    assert undecided.bias_variance == pytest.approx(0.1**2 - 4e-4)
     assert not undecided.is_wrong
+
+
+def test_without_a_decision_of_own_sensors_even_a_majority_is_as_biased_as_it_is_far_off() -> None:
+    own, honest, liar = at(0.0, sigma=0.1), at(0.0), at(0.06)
+    lying = compared_with_own_sensors(liar, own, {"a": liar, "b": liar, "c": honest})
+    right = compared_with_own_sensors(honest, own, {"a": liar, "b": liar, "c": liar})
+    assert lying.bias_variance == right.bias_variance == pytest.approx(0.06**2 - 4e-4)
+    nearer = compared_with_own_sensors(honest, at(0.0, sigma=0.02), {"a": liar, "b": liar})
+    assert nearer.bias_variance == 0.0
+
+
+def test_vague_own_sensors_lower_the_weight_of_nobody_alone() -> None:
+    assert compared_with_own_sensors(at(0.3), at(0.0, sigma=0.1), {}).bias_variance == 0.0
+    assert compared_with_own_sensors(at(0.2), at(0.0, sigma=0.07), {}).bias_variance > 0.0
 
 
 def test_a_contested_source_is_used_while_own_sensors_are_nearer_to_it_than_to_its_rivals() -> None:

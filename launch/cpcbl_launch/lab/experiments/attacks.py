@@ -15,6 +15,7 @@ from msgspec import Struct
 from msgspec.structs import replace
 from rich.console import RenderableType
 
+from cpcbl_launch.lab.experiments.trust_watch import TrustWatch
 from cpcbl_launch.lab.faulty_robot import Fault
 from cpcbl_launch.lab.lying_observer import LyingObserver
 from cpcbl_launch.reporting.metrics import Score, score
@@ -25,10 +26,7 @@ from cpcbl_launch.simulation.field_node import FieldNode
 from cpcbl_launch.simulation.in_process import robot_nodes, run_nodes
 from cpcbl_launch.team.file import builtin_path, load_team
 from cpcbl_team.config import Team
-from cpcbl_transport.bus import Bus
-from cpcbl_transport.decoding import Received, Subscriber
 from cpcbl_transport.memory_bus import MemoryHub
-from cpcbl_transport.messages import Status
 
 HONEST = ("north", "south")
 ONE, TWO, GUEST = ("west",), ("west", "east"), ("ghost",)
@@ -117,29 +115,12 @@ def attack_team(attack: Attack) -> Team:
     return replace(team, robots={name: r for name, r in robots.items() if name in kept})
 
 
-class _Statuses:
-    """When the victim first said what of whom."""
-
-    def __init__(self, bus: Bus, victim: str) -> None:
-        self.doubted_s: dict[str, float] = {}  # in quarantine, or contested
-        self.quarantined: set[str] = set()
-        self._victim = victim
-        self._subscriber = Subscriber(bus, Status, self._on_message)
-
-    def _on_message(self, received: Received[Status]) -> None:
-        status = received.message
-        for trust in status.trust if status.robot == self._victim else ():
-            if trust.reason:
-                self.quarantined.add(trust.peer)
-            if trust.reason or trust.contested:
-                self.doubted_s.setdefault(trust.peer, status.stamp_ns * 1e-9)
-
-
 def run_attack(attack: Attack, seed: int) -> AttackRun:
     """One run. The same attack and seed give the same figures."""
     team, hub = attack_team(attack), MemoryHub()
     recorder = Recorder(hub.session())
-    statuses = _Statuses(hub.session(), attack.victim)
+    reported = TrustWatch()
+    reported.attach(hub.session())
     field = FieldNode(SimulatedField(team, seed, 0), hub.session())
     nodes = robot_nodes(team, hub, 0)
     correct = [n for name, n in zip(team.robots, nodes, strict=True) if name not in attack.liars]
@@ -153,9 +134,11 @@ def run_attack(attack: Attack, seed: int) -> AttackRun:
     run_nodes([field, *correct, *liars], 0, int(attack.end_s * 1e9))
     truth = recorder.simulated_truth()[attack.victim]
     of_victim = score(recorder.samples(attack.victim, truth, attack.from_s))
-    noticed_s = [at_s for name, at_s in statuses.doubted_s.items() if name in attack.liars]
+    doubted_s = reported.doubted_s(attack.victim)
+    noticed_s = [at_s for name, at_s in doubted_s.items() if name in attack.liars]
     after_s = min(noticed_s) - attack.from_s if noticed_s else None
-    return AttackRun(of_victim, after_s, len(statuses.quarantined & set(HONEST)))
+    quarantined = {q.of for q in reported.quarantines if q.by == attack.victim}
+    return AttackRun(of_victim, after_s, len(quarantined & set(HONEST)))
 
 
 # Over all seeds -----------------------------------------------------------------------------------

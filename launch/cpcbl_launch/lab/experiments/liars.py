@@ -37,15 +37,13 @@ from cpcbl_launch.lab.experiments.runs import (
     spread,
     with_settings,
 )
+from cpcbl_launch.lab.experiments.trust_watch import Quarantine, TrustWatch
 from cpcbl_launch.lab.faulty_robot import Fault, FaultyBus
 from cpcbl_launch.reporting.metrics import score
 from cpcbl_launch.reporting.tables import number, table
 from cpcbl_launch.simulation.in_process import simulate
 from cpcbl_launch.team.file import builtin_path, load_team
 from cpcbl_team.config import Team, TrustSettings
-from cpcbl_transport.bus import Bus
-from cpcbl_transport.decoding import Received, Subscriber
-from cpcbl_transport.messages import Status
 
 FROM_S, UNTIL_S, END_S = 10.0, 25.0, 45.0
 MOST_RATIO = 1.3
@@ -68,16 +66,6 @@ class Case(Struct, frozen=True, kw_only=True):
     liar: bool = True  # whether the faulty observer is there at all
     honest: int = 2  # the number of correct observers
     trust: bool = True  # whether robots assess the trust in their teammates
-
-
-class Quarantine(NamedTuple):
-    """A quarantine of one sender by one robot; seconds from the start."""
-
-    by: str
-    of: str
-    reason: str
-    from_s: float
-    until_s: float | None
 
 
 class Run(NamedTuple):
@@ -134,28 +122,6 @@ def cases() -> Mapping[Case | Attack, Case | Attack]:
     return {case: case for case in [*every, *with_bases(attacks())]}
 
 
-class _Statuses:
-    """Collects the quarantines that robots report in a run."""
-
-    def __init__(self) -> None:
-        self.found: dict[tuple[str, str, int], Quarantine] = {}
-
-    def attach(self, bus: Bus) -> None:
-        self._subscriber = Subscriber(bus, Status, self._on_message)
-
-    def _on_message(self, received: Received[Status]) -> None:
-        status = received.message
-        for trust in status.trust:
-            key_ = status.robot, trust.peer, trust.quarantines
-            since_ns = trust.since_ns or status.stamp_ns  # the status has no time for a wrong clock
-            first = self.found.get(key_)
-            if trust.reason:
-                from_s = since_ns * 1e-9 if first is None else first.from_s
-                self.found[key_] = Quarantine(status.robot, trust.peer, trust.reason, from_s, None)
-            elif first is not None and first.until_s is None:
-                self.found[key_] = first._replace(until_s=since_ns * 1e-9)
-
-
 def run_case(case: Case | Attack, seed: int) -> Run | AttackRun:
     """One run. The same case and seed give the same figures."""
     return run_attack(case, seed) if isinstance(case, Attack) else run_fault(case, seed)
@@ -163,17 +129,17 @@ def run_case(case: Case | Attack, seed: int) -> Run | AttackRun:
 
 def run_fault(case: Case, seed: int) -> Run:
     """One run with a faulty observer, or without it."""
-    statuses, through = _Statuses(), {}
+    reported, through = TrustWatch(), {}
     if case.lie:
         fault = Fault.parse(f"{case.lie}@{FROM_S}-{UNTIL_S}")
         through = {LIAR: partial(FaultyBus, fault=fault, name=LIAR, start_ns=0)}
-    watch, team = statuses.attach, liars_team(case)
-    _, recorder = simulate(team, seed, END_S, watch=watch, bus_wrappers=through)
+    team = liars_team(case)
+    _, recorder = simulate(team, seed, END_S, watch=reported.attach, bus_wrappers=through)
     truth = recorder.simulated_truth()
     scores = {name: score(recorder.samples(name, truth[name], FROM_S)) for name in DRIVERS}
     rmse_m = {name: s.position_rmse_m or 0.0 for name, s in scores.items()}
     inside = sum(s.inside_3_sigma or 0.0 for s in scores.values()) / len(scores)
-    return Run(rmse_m, inside, tuple(statuses.found.values()))
+    return Run(rmse_m, inside, reported.quarantines)
 
 
 def outcome(results: Results) -> Liars:
