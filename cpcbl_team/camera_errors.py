@@ -11,7 +11,7 @@ from typing import NamedTuple
 import msgspec
 
 from cpcbl_team.geometry import wrap_angle
-from cpcbl_team.inputs import Sighting
+from cpcbl_team.inputs import MarkerSighting, Sighting
 
 
 class CameraErrors(NamedTuple):
@@ -38,7 +38,8 @@ def without_errors(sighting: Sighting, errors: CameraErrors, axis_rad: float) ->
     factor, off_axis = math.exp(errors.focal), sighting.bearing_rad - axis_rad
     depth, across = factor * math.cos(off_axis), math.sin(off_axis)
     bearing = wrap_angle(math.atan2(across, depth) + axis_rad - errors.yaw_rad)
-    turn = bearing - sighting.bearing_rad
+    by_focal = heading_sensitivity(sighting, axis_rad)
+    turn = -errors.yaw_rad - by_focal * errors.focal
     range_m, sigma, heading = sighting.range_m, sighting.range_sigma_m, sighting.heading_rad
     stretch = math.hypot(depth, across)
     return msgspec.structs.replace(
@@ -58,3 +59,11 @@ def range_sensitivity(range_m: float, off_axis_rad: float) -> tuple[float, float
 def bearing_sensitivity(off_axis_rad: float) -> tuple[float, float]:
     """The derivatives of a bearing by yaw and focal length: (1, rad)."""
     return 1.0, math.sin(off_axis_rad) * math.cos(off_axis_rad)
+
+
+def heading_sensitivity(sighting: Sighting, axis_rad: float) -> float:
+    """The derivative (rad) of a teammate's heading in the robot's frame by the focal length. That
+    by the yaw is 1. Without markers the heading turns with the line of sight."""
+    if isinstance(sighting, MarkerSighting):
+        return sighting.heading_per_focal
+    return bearing_sensitivity((sighting.bearing_rad or 0.0) - axis_rad)[1]

@@ -14,6 +14,7 @@ from typing import Final, NamedTuple
 from cpcbl_team.camera_errors import (
     CameraErrors,
     bearing_sensitivity,
+    heading_sensitivity,
     range_sensitivity,
     without_errors,
 )
@@ -92,10 +93,11 @@ class CommonErrors(NamedTuple):
         focal = d * x + e * y + f * turn + yf * cy + ff * cf
         return of_pose, (yaw, focal)
 
-    @property
-    def of_direction(self) -> float:
-        """What they add to the variance (rad^2) of a direction in the field."""
-        return self.covariance.xx - 2.0 * self.of_yaw[2]
+    def of_heading(self, sighting: Sighting) -> float:
+        """What they add to the variance (rad^2) of the heading of a sighted teammate in the field.
+        It may be negative: they explain errors of the pose."""
+        by_focal = heading_sensitivity(sighting, self.axis_rad)
+        return self.innovation(((0.0, 0.0, 1.0),), ((-1.0, -by_focal),)).xx
 
     def of_point(self, dx: float, dy: float, bearing_rad: float) -> Covariance2:
         """What they add to the covariance (m^2) of a point that is seen at this bearing, (dx, dy)

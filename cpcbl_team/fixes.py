@@ -66,7 +66,7 @@ def fix_for(
     turned = covariance.hh
     if common is not None:
         observer_part += common.of_point(dx, dy, bearing)
-        turned += common.of_direction
+        turned += common.of_heading(sighting)
     fix = Fix(sighting.id, observer, stamp_ns, x, y, rotated, observer_part)
     heading, heading_sigma = sighting.heading_rad, sighting.heading_sigma_rad
     if heading is None or heading_sigma is None:

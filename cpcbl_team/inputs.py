@@ -39,6 +39,16 @@ class Sighting(msgspec.Struct, frozen=True, array_like=True):
     heading_sigma_rad: float | None = None
 
 
+class MarkerSighting(Sighting, frozen=True, array_like=True):
+    """A sighting of a teammate by its markers. On the wire it is a `Sighting`.
+
+    `heading_per_focal` (rad): by how much the heading is read too large if the true focal length is
+    larger than the stated one, a unit of the logarithm of their ratio.
+    """
+
+    heading_per_focal: float = 0.0
+
+
 class SightingFault(StrEnum):
     """Why a sighting must not be used; the names of counts."""
 

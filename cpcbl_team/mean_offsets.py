@@ -30,6 +30,7 @@ SLOW_COMMON_M: Final = 0.01
 the estimate, which differs between the times of their reports, the more the longer the mean."""
 CONFLICT: Final = 18.0
 """Two sources contradict each other beyond this chi-square (two degrees of freedom)."""
+ALTERNATING_NS: Final = 200_000_000  # between two sources whose reports alternate
 USUAL: Final = 6.0  # 95 % of correct sources differ by less (chi-square, two degrees of freedom)
 LEAD: Final = 7.0
 """Of two that contradict each other one is clearly nearer to a third source by this difference of
@@ -51,6 +52,8 @@ class MeanOffset(NamedTuple):
     y: float
     covariance: Covariance2
     common_m: float = FAST_COMMON_M  # sigma of an error that never averages away
+    stamp_ns: int = 0  # of its last report, and the variance (m^2, both axes) of the estimate then
+    estimate_variance: float = 0.0
 
     @property
     def length_m(self) -> float:
@@ -109,9 +112,14 @@ class FadingOffsets(NamedTuple):
         )
         return new(FadingOffsets, fields)
 
-    def mean(self, heading_variance: float, common_m: float = FAST_COMMON_M) -> MeanOffset | None:
-        """The mean of the reports, if they are enough to determine one. `heading_variance` (rad^2):
-        that of the estimate."""
+    def mean(
+        self,
+        heading_variance: float,
+        common_m: float = FAST_COMMON_M,
+        estimate_variance: float = 0.0,
+    ) -> MeanOffset | None:
+        """The mean of the reports, if they are enough to determine one. `heading_variance` (rad^2)
+        and `estimate_variance` (m^2, both axes): those of the estimate."""
         if self.reports < LEAST_REPORTS:
             return None
         (xx, xy, yy), (x, y) = about_position(self.evidence, heading_variance)
@@ -122,7 +130,8 @@ class FadingOffsets(NamedTuple):
         # The variance of a weighted mean: old reports fade, so their errors do too.
         covariance = Covariance2(cxx, cxy, cyy).scaled(self.squares / self.reports)
         covariance += self.dependent
-        return MeanOffset(cxx * x + cxy * y, cxy * x + cyy * y, covariance, common_m)
+        offset = cxx * x + cxy * y, cxy * x + cyy * y
+        return MeanOffset(*offset, covariance, common_m, self.stamp_ns, estimate_variance)
 
     def turn(self) -> MeanTurn | None:
         """What the reports say of the heading of the estimate, whatever its position is; None if
@@ -153,6 +162,7 @@ def disagreement(one: MeanOffset, other: MeanOffset) -> float:
     """The chi-square of the difference of two means (two degrees of freedom)."""
     (xx, xy, yy), (oxx, oxy, oyy) = one.covariance, other.covariance
     common = one.common_m * one.common_m + other.common_m * other.common_m
+    common += _growth(one, other)
     sum_ = Covariance2(xx + oxx + common, xy + oxy, yy + oyy + common)
     return sum_.mahalanobis_squared(one.x - other.x, one.y - other.y)
 
@@ -164,8 +174,18 @@ def bias_variance(one: MeanOffset, other: MeanOffset) -> float:
         return 0.0
     dx, dy = one.x - other.x, one.y - other.y
     c, d = one.covariance, other.covariance
-    excess = dx * dx + dy * dy - (c.xx + c.yy + d.xx + d.yy)
+    excess = dx * dx + dy * dy - (c.xx + c.yy + d.xx + d.yy + 2.0 * _growth(one, other))
     return excess if excess > 0.0 else 0.0
+
+
+def _growth(one: MeanOffset, other: MeanOffset) -> float:
+    """By how much the variance (m^2) of the estimate grew between the last reports of two sources,
+    one of which is silent: so far odometry alone may have changed the estimate's error. Sources
+    whose reports alternate have all changes of it in common."""
+    earlier, later = (one, other) if one.stamp_ns <= other.stamp_ns else (other, one)
+    if later.stamp_ns - earlier.stamp_ns <= ALTERNATING_NS:
+        return 0.0
+    return max(0.0, later.estimate_variance - earlier.estimate_variance)
 
 
 class Comparison(NamedTuple):

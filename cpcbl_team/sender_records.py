@@ -71,7 +71,8 @@ class OffsetEvidence(NamedTuple):
 
     evidence: Sums  # by the independent part of the noise
     dependent: Covariance2 = NOTHING  # the part that is the same in all reports, m^2
-    heading_variance: float = 1.0  # of the estimate, rad^2
+    heading_variance: float = 1.0  # of the estimate, rad^2,
+    position_variance: float = 0.0  # and of its position, m^2, both axes
 
     def weighted(self, weight: float) -> "OffsetEvidence":
         """With this weight, below one for a report that contradicts the estimate clearly: it would
@@ -155,13 +156,16 @@ def with_report(record: SenderRecord, report: TeammateReport, limit: float) -> S
 
 def with_evidence(record: SenderRecord, stamp_ns: int, report: OffsetEvidence) -> SenderRecord:
     """The record with one more report in its means."""
-    evidence, dependent, heading_variance = report
+    evidence, dependent, heading_variance, variance = report
     offsets = tuple(
         sums.with_report(stamp_ns, fading_ns, evidence, dependent)
         for sums, fading_ns in zip(record.offsets, (FAST_NS, SLOW_NS), strict=True)
     )
     fast, slow = offsets
-    means = fast.mean(heading_variance), slow.mean(heading_variance, SLOW_COMMON_M)
+    means = (
+        fast.mean(heading_variance, estimate_variance=variance),
+        slow.mean(heading_variance, SLOW_COMMON_M, variance),
+    )
     return replace(record, offsets=offsets, means=means)
 
 

@@ -53,8 +53,7 @@ def without_duplicates(sightings: tuple[Sighting, ...]) -> tuple[Sighting, ...]:
 def corrected_sighting(sighting: Sighting, sensor: SensorSettings, teammate: bool) -> Sighting:
     """The sighting without the sensor's systematic errors; a faulty one is not changed. A heading
     is measured relative to the line of sight, so it changes with the bearing."""
-    parts = msgspec.structs.astuple(sighting)
-    name, range_m, bearing, range_sigma, bearing_sigma, heading, heading_sigma = parts
+    range_m, bearing, heading = sighting.range_m, sighting.bearing_rad, sighting.heading_rad
     if any(angle is not None and abs(angle) > math.pi for angle in (bearing, heading)):
         return sighting
     if range_m is not None:
@@ -67,7 +66,8 @@ def corrected_sighting(sighting: Sighting, sensor: SensorSettings, teammate: boo
         bias, seen = math.radians(sensor.bearing_bias_deg), bearing
         bearing = wrap_angle(sensor.bearing_scale * seen - bias)
         heading = None if heading is None else wrap_angle(heading + bearing - seen)
-    return Sighting(name, range_m, bearing, range_sigma, bearing_sigma, heading, heading_sigma)
+    read = {"range_m": range_m, "bearing_rad": bearing, "heading_rad": heading}
+    return msgspec.structs.replace(sighting, **read)
 
 
 def recalibrated(frame: Sightings, bias_rad: float, range_scale: float = 1.0) -> Sightings:

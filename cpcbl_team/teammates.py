@@ -17,7 +17,7 @@ from cpcbl_team.fusion import Observation
 from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.inputs import Belief, Input, Position, Sightings
 from cpcbl_team.landmarks import LandmarkUpdate
-from cpcbl_team.mean_offsets import HEADING_VARIANCE, about_position
+from cpcbl_team.mean_offsets import HEADING_VARIANCE, NOTHING, about_position
 from cpcbl_team.measurements import (
     GatedObject,
     GatedObjects,
@@ -135,8 +135,9 @@ class TeammateScreen:
         dependent = observation.dependent
         sums = observation.information(observation.noise(0.0))
         variance = 0.5 * (dependent.xx + dependent.yy)
-        hh = state.estimate.covariance.hh
-        return OffsetEvidence(sums, Covariance2(variance, 0.0, variance), hh)
+        own = state.estimate.covariance
+        dependent = Covariance2(variance, 0.0, variance)
+        return OffsetEvidence(sums, dependent, own.hh, own.xx + own.yy)
 
     def screen_observation(
         self, state: State, observation: PoseObservation, position: Observation, nis: float
@@ -151,7 +152,8 @@ class TeammateScreen:
             if self.has_recent_reports(state, now) and not is_lost:
                 is_accepted = nis <= self._gates[1]
                 sums = position.information(position.noise(0.0))
-                own = OffsetEvidence(sums, heading_variance=state.estimate.covariance.hh)
+                prior = state.estimate.covariance
+                own = OffsetEvidence(sums, NOTHING, prior.hh, prior.xx + prior.yy)
                 state = self._with_own_sensors(state, is_accepted, not is_accepted, own)
             return state, True
         heading, of_heading = observation.of_heading(state.estimate.pose), None
@@ -226,9 +228,10 @@ class TeammateScreen:
 
 def _own_offset(state: State, sums: Information, accepted: Iterable[GatedObject]) -> OffsetEvidence:
     """What the robot's own sensors say of the offset of the estimate in one frame."""
-    common, variance = state.common_errors, state.estimate.covariance.hh
+    common, own = state.common_errors, state.estimate.covariance
+    variance, of_position = own.hh, own.xx + own.yy
     if common is None:
-        return OffsetEvidence(sums, heading_variance=variance)
+        return OffsetEvidence(sums, NOTHING, variance, of_position)
     of_yaw = of_focal = Information.none()
     for found in accepted:
         if not found.measurement.is_teammate:
@@ -246,7 +249,8 @@ def _own_offset(state: State, sums: Information, accepted: Iterable[GatedObject]
         ay * ay * yy + 2.0 * ay * by * yf + by * by * ff,
     )
     position = _without_heading(sums, variance)
-    return OffsetEvidence(position, dependent, variance).weighted(INDEPENDENT_FRAMES)
+    evidence = OffsetEvidence(position, dependent, variance, of_position)
+    return evidence.weighted(INDEPENDENT_FRAMES)
 
 
 def _with_camera(state: State, m: Measurement, evidence: OffsetEvidence) -> OffsetEvidence:

@@ -140,7 +140,8 @@ def run_robot(
         callbacks = NodeCallbacks(loop.on_arrival, on_status)
         node = Node(robot, team, wrap_bus(bus), start, callbacks)
         logger.log_connected(team, link.endpoints)
-        loop.run(node, with_watchdog(stop_on_clock_step(name, team, clock, stop)))
+        with robot.sensing.detect_on_thread(loop.wake):
+            loop.run(node, with_watchdog(stop_on_clock_step(name, team, clock, stop)))
 
 
 def make_robot(

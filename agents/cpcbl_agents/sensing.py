@@ -1,12 +1,14 @@
 """The sensing agent: it takes inputs of any source and corrects odometry and sightings."""
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing, contextmanager
 from typing import TYPE_CHECKING
 
 import msgspec
 
 from cpcbl_agents.agent import AgentMessage, FrameSubscribers, PoseEstimate, Tick
+from cpcbl_agents.detection_worker import DetectedFrame, DetectionWorker, detect
 from cpcbl_agents.sources import OwnCamera, Picture, Source
 from cpcbl_agents.waypoint_follower import WaypointFollower
 from cpcbl_team.config import LocalizationSettings
@@ -47,15 +49,27 @@ class SensingAgent:
         self._sources = [s for s in (source, camera) if s is not None]
         self._follower, self._detector, self._has_subscribers = follower, detector, False
         self._correction = correction
+        self._worker: DetectionWorker | None = None
+        self._held: list[Odometry] = []  # that came while the worker had a frame
         self._annotated_ns = -ANNOTATION_INTERVAL_NS
         self._counts: Counter[str] = Counter()
         self.refused: Counter[str] = Counter()
         """What could not be used, by reason."""
 
+    @contextmanager
+    def detect_on_thread(self, wake: Callable[[], None]) -> Iterator[None]:
+        """Until the end, the detector works on a thread of its own, which calls `wake` for each of
+        its results: a tick then takes them."""
+        if self._detector is None:
+            yield
+            return
+        with closing(DetectionWorker(self._detector, wake)) as self._worker:
+            yield
+
     @property
     def counts(self) -> Counter[str]:
         """What was sensed, and what could not be used, by reason."""
-        parts = (self._camera, self._detector, self._correction)
+        parts = (self._camera, self._worker or self._detector, self._correction)
         return sum((part.counts for part in parts if part is not None), self._counts)
 
     @property
@@ -65,7 +79,8 @@ class SensingAgent:
     @property
     def problems(self) -> tuple[str, ...]:
         """What the robot doubts about its camera, as sentences."""
-        parts = (p for p in (self._detector, self._correction) if p is not None)
+        detector = self._worker or self._detector
+        parts = (p for p in (detector, self._correction) if p is not None)
         return tuple(problem for part in parts for problem in part.problems)
 
     @property
@@ -80,7 +95,9 @@ class SensingAgent:
         match message:
             case Tick():
                 items = [item for source in self._sources for item in source.poll(now_ns)]
-                return [out for item in items for out in self._process(item)]
+                outgoing = [out for item in items for out in self._process(item)]
+                results = self._worker.collect() if self._worker is not None else ()
+                return [*outgoing, *(out for found in results for out in self._take(found))]
             case Odometry() | Sightings() | Position() | Frame():
                 return self._process(message)
             case FrameSubscribers():
@@ -99,22 +116,44 @@ class SensingAgent:
             self._refuse("no_camera")
             return ()
         self._counts["frame"] += 1
-        outgoing: list[AgentMessage] = []
         is_recent = 0 <= item.stamp_ns - self._annotated_ns < ANNOTATION_INTERVAL_NS
-        if self._has_subscribers and not is_recent:
+        annotates = self._has_subscribers and not is_recent
+        if annotates:
             self._annotated_ns = item.stamp_ns
-            sightings, annotated = self._detector.detect_and_annotate(item)
-            outgoing.append(annotated)
-        else:
-            sightings = self._detector.detect(item)
-        if isinstance(sightings, str):
-            self._refuse(sightings)
+        if self._worker is None:
+            return self._take(detect(self._detector, item, annotates))
+        if self._worker.submit(item, annotates):
+            self._counts["frame_skipped"] += 1
+        return ()
+
+    def _take(self, found: DetectedFrame) -> Sequence[AgentMessage]:
+        """What follows from a frame that the detector has looked at."""
+        outgoing: list[AgentMessage] = [] if found.annotated is None else [found.annotated]
+        self._release_odometry(found.stamp_ns)
+        if isinstance(found.sightings, str):
+            self._refuse(found.sightings)
             return outgoing
-        frame = self._corrected_frame(sightings)
+        frame = self._corrected_frame(found.sightings)
         if self._correction is None:
             return [*outgoing, frame]
         frame, change = self._correction.correct(frame)
         return [*outgoing, frame, *([] if change is None else [change])]
+
+    def _add_odometry(self, piece: Odometry) -> None:
+        """Tells the check of the camera of a motion, in the order in which motions and frames were
+        measured."""
+        if self._correction is None:
+            return
+        if self._worker is not None and self._worker.is_busy:
+            self._held.append(piece)
+            return
+        self._release_odometry(piece.stamp_ns)
+        self._correction.add_odometry(piece)
+
+    def _release_odometry(self, until_ns: int) -> None:
+        """Tells it of the motions that were held, and were measured by then."""
+        while self._held and self._held[0].stamp_ns <= until_ns and self._correction is not None:
+            self._correction.add_odometry(self._held.pop(0))
 
     def _correct(self, item: Odometry | Sightings | Position) -> Odometry | Sightings | Position:
         if isinstance(item, Sightings):
@@ -122,8 +161,7 @@ class SensingAgent:
         self._counts[type(item).__name__.lower()] += 1
         if isinstance(item, Odometry):
             piece = corrected_odometry(item, self._odometry)
-            if self._correction is not None:
-                self._correction.add_odometry(piece)
+            self._add_odometry(piece)
             return piece
         return msgspec.structs.replace(item, stamp_ns=item.stamp_ns - self._position_delay_ns)
 

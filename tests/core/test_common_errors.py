@@ -24,7 +24,7 @@ from cpcbl_team.estimate import Covariance3, Estimate
 from cpcbl_team.fixes import fix_for
 from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.geometry import Pose2, step, wrap_angle
-from cpcbl_team.inputs import Odometry, Sighting, Sightings
+from cpcbl_team.inputs import MarkerSighting, Odometry, Sighting, Sightings
 from cpcbl_team.localizer import Localizer
 from cpcbl_team.state import State
 
@@ -167,7 +167,8 @@ def test_an_update_is_that_of_an_augmented_kalman_filter() -> None:
     assert [*common.of_yaw, *common.of_focal] == pytest.approx([*p[:3, 3], *p[:3, 4]])
 
 
-def test_a_fix_is_as_uncertain_as_the_camera_makes_it() -> None:
+@pytest.mark.parametrize("by_markers", [False, True])
+def test_a_fix_is_as_uncertain_as_the_camera_makes_it(by_markers: bool) -> None:
     """Its observer's part is the covariance of a point by pose, yaw and focal length."""
     random = np.random.default_rng(5)
     root = random.normal(size=(5, 5)) * np.array([0.05, 0.05, 0.03, 0.03, 0.02])[:, None]
@@ -175,7 +176,8 @@ def test_a_fix_is_as_uncertain_as_the_camera_makes_it() -> None:
     cov = Covariance3(p[0, 0], p[0, 1], p[1, 1], p[0, 2], p[1, 2], p[2, 2])
     joint = Covariance2(p[3, 3], p[3, 4], p[4, 4])
     common = CommonErrors(0.4, NO_ERRORS, joint, tuple(p[:3, 3]), tuple(p[:3, 4]))
-    pose, read = Pose2(1.0, 2.0, 0.7), Sighting("mate", 3.0, 0.9, 0.001, 0.001, 0.2, 0.01)
+    pose, numbers = Pose2(1.0, 2.0, 0.7), ("mate", 3.0, 0.9, 0.001, 0.001, 0.2, 0.01)
+    read = MarkerSighting(*numbers, -0.6) if by_markers else Sighting(*numbers)
 
     def seen(e: np.ndarray) -> np.ndarray:
         true = without_errors(read, CameraErrors(float(e[3]), float(e[4])), 0.4)
@@ -185,7 +187,7 @@ def test_a_fix_is_as_uncertain_as_the_camera_makes_it() -> None:
         assert true.heading_rad
         b = true.bearing_rad
         point = at.transform(true.range_m * math.cos(b), true.range_m * math.sin(b))
-        return np.array([*point])
+        return np.array([*point, at.heading + true.heading_rad])
 
     step_ = 1e-5
     jacobian = np.array([(seen(step_ * e) - seen(-step_ * e)) / (2 * step_) for e in np.eye(5)]).T
@@ -194,11 +196,11 @@ def test_a_fix_is_as_uncertain_as_the_camera_makes_it() -> None:
     assert fix is not None
     assert alone is not None
     without_arc = jacobian[:, :3] @ p[:3, :3] @ jacobian[:, :3].T
-    due = jacobian @ p @ jacobian.T - without_arc
+    due = (jacobian @ p @ jacobian.T - without_arc)[:2, :2]
     xx, xy, yy = np.array(fix.observer_covariance) - np.array(alone.observer_covariance)
     assert [[xx, xy], [xy, yy]] == [pytest.approx(row, rel=1e-3, abs=1e-9) for row in due.tolist()]
     turned = fix.heading_observer_variance - alone.heading_observer_variance
-    assert turned == pytest.approx(p[3, 3] - 2.0 * p[2, 3])
+    assert turned == pytest.approx((jacobian @ p @ jacobian.T - without_arc)[2, 2], rel=1e-3)
 
 
 def test_a_robot_without_a_camera_knows_nothing_of_one() -> None:

@@ -212,3 +212,30 @@ def test_of_a_contested_source_the_longer_mean_decides_whether_it_is_used() -> N
     assert both(fast, slow).bias_variance == 0.01
     assert both(fast, Comparison(0.01)).is_left_out  # the slow one says nothing yet
     assert both(Comparison(0.01), Comparison(0.04)).bias_variance == 0.04
+
+
+@pytest.mark.parametrize(
+    ("silent_s", "sigma_m", "is_wrong"),
+    [
+        (0.5, 0.06, False),
+        (0.5, 0.01, True),
+        (0.1, 0.06, True),
+    ],
+)
+def test_what_odometry_changed_since_the_own_sensors_were_silent_is_nobodys_fault(
+    silent_s: float, sigma_m: float, is_wrong: bool
+) -> None:
+    """The estimate became less certain while one source was silent, so its error may be another
+    one. Sources whose reports alternate speak of the same error."""
+    now_ns = 10 * SECOND
+    own = at(0.0)._replace(stamp_ns=now_ns - round(silent_s * SECOND), estimate_variance=0.01**2)
+    mate = at(0.09)._replace(stamp_ns=now_ns, estimate_variance=sigma_m**2)
+    assert compared_with_own_sensors(mate, own, {}).is_wrong is is_wrong
+    assert compared_with_own_sensors(own, mate, {}).is_wrong is is_wrong
+    assert (bias_variance(mate, own) > 0.0) is is_wrong
+
+
+def test_a_mean_knows_how_certain_the_estimate_was_at_its_last_report() -> None:
+    mean = summed([(0.0, 0.0)] * 10).mean(0.01, estimate_variance=0.02)
+    assert mean is not None
+    assert (mean.stamp_ns, mean.estimate_variance) == (9 * SECOND // 10, 0.02)

@@ -24,7 +24,7 @@ from cpcbl_agents.vision.marker_fits import MarkerFits
 from cpcbl_agents.vision.poses import Lean, PoseFit, fit_pose
 from cpcbl_agents.vision.quads import dark_quads
 from cpcbl_team.config import Side, Team
-from cpcbl_team.inputs import Sighting
+from cpcbl_team.inputs import MarkerSighting, Sighting
 
 LEAST_SIDE_PX = 6.0
 BATCH = 64  # quads that are read together, the most likely first, until the time of a frame is over
@@ -260,7 +260,10 @@ def sighting(name: str, fit: PoseFit) -> Sighting:
     heading_sigma = math.hypot(math.sqrt(fit.covariance[2, 2]), LEAST_HEADING_SIGMA)
     if heading_sigma > CLEAR_RAD:
         return Sighting(name, range_m, bearing, range_sigma, bearing_sigma)
-    return Sighting(name, range_m, bearing, range_sigma, bearing_sigma, heading, heading_sigma)
+    read = name, range_m, bearing, range_sigma, bearing_sigma, heading, heading_sigma
+    if fit.heading_per_focal is None:
+        return Sighting(*read)
+    return MarkerSighting(*read, fit.heading_per_focal)
 
 
 def _framed_quads(grey: Pixels, quads: Floats, cells: int) -> Floats:

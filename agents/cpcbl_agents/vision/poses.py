@@ -61,14 +61,16 @@ class Lean(NamedTuple):
 
 class PoseFit(NamedTuple):
     """`viewer_from_mate`, its covariance (3, 3; m, rad), the mean squared error in sigmas (infinite
-    if no pose fits at all), the lean of the camera which that pose implies, and the variance of the
-    corners, as a multiple of the stated one."""
+    if no pose fits at all), the lean of the camera which that pose implies, the variance of the
+    corners, as a multiple of the stated one, and the derivative (rad) of the heading by the
+    logarithm of the true focal length over the stated one; None where it is not linear."""
 
     pose: Pose2
     covariance: Floats
     misfit: float
     lean: Lean
     corner_variance: float
+    heading_per_focal: float | None = None
 
 
 def side_corners(side: Side, vision: VisionSettings) -> Floats:
@@ -135,15 +137,17 @@ def _fit(
     covariances *= inflation
     headings = np.sqrt(covariances[:, 2, 2])
     mean, covariance = poses[best], covariances[best]
+    per_focal: float | None = view.heading_per_focal(poses[best])
     if headings[best] > NARROW or np.ptp(_wrap(poses[possible, 2] - mean[2])) > NARROW:
         pivot = shape[:4, :2].mean(axis=0)
         mean, covariance = _average_over_headings(
             poses[possible], headings[possible], pivot, view, inflation
         )
+        per_focal = None
     x, y, heading = mean.tolist()
     pose = Pose2(x, y, wrap_angle(heading))
     lean = view.lean(poses[best])
-    return PoseFit(pose, covariance, misfit, lean, misfit * corner_variance)
+    return PoseFit(pose, covariance, misfit, lean, misfit * corner_variance, per_focal)
 
 
 def _inverse(matrices: Floats) -> Floats:
@@ -228,6 +232,13 @@ class _Reprojection:
         errors = self._derivatives(pose[None])[0, :, 3]
         tilt, roll = self._lean_errors @ self._weights @ errors
         return Lean(float(tilt) * self._sigmas.tilt, float(roll) * self._sigmas.roll)
+
+    def heading_per_focal(self, pose: Floats) -> float:
+        """The derivative of the heading by the logarithm of the focal length, at a pose (3,): a
+        longer lens moves the corners away from the optical axis, in proportion."""
+        jacobian = self._derivatives(pose[None])[0, :, :3]
+        weighted = jacobian.T @ self._weights
+        return float(np.linalg.solve(weighted @ jacobian, weighted @ self._plane.ravel())[2])
 
     def _derivatives(self, poses: Floats) -> Floats:
         """The matrices J (k, 2n, 4)."""

@@ -11,7 +11,9 @@ from support.cameras import calibrated
 from support.markers import SIDES, seen_at
 
 from cpcbl_agents.vision.camera import Camera, Floats
+from cpcbl_agents.vision.markers import sighting
 from cpcbl_agents.vision.poses import CORNER_SHARE, NARROW, SIDE_ANGLES, fit_pose
+from cpcbl_team.camera_errors import CameraErrors, without_errors
 from cpcbl_team.config import CameraSettings, Side, VisionSettings
 from cpcbl_team.geometry import Pose2, wrap_angle
 
@@ -89,3 +91,25 @@ def test_corners_that_no_pose_shows_are_misfits() -> None:
     bent = corners + np.array([[0.0, 0.0], [0.0, 0.0], [0.02, 0.02], [0.0, 0.0]])
     assert fit_pose({"front": corners}, VISION, camera).misfit < 1e-3
     assert fit_pose({"front": bent}, VISION, camera).misfit > 20.0
+
+
+@pytest.mark.parametrize("share", [0.95, 1.05])
+@pytest.mark.parametrize(("bearing_deg", "heading_deg"), [(45.0, 0.0), (30.0, 70.0), (-26.0, 40.0)])
+def test_a_heading_that_a_wrong_focal_length_turned_is_corrected(
+    share: float, bearing_deg: float, heading_deg: float
+) -> None:
+    stated = calibrated(yaw_sigma_deg=0.0, focal_share=0.0)
+    built = Camera(replace(stated, fx_px=share * stated.fx_px, fy_px=share * stated.fy_px))
+    camera, bearing = Camera(stated), math.radians(bearing_deg)
+    robot = Pose2(2.0 * math.cos(bearing), 2.0 * math.sin(bearing), math.radians(heading_deg))
+    seen = {
+        side: camera.undistort(built.project(seen_at(robot, side, VISION)))
+        for side in SIDES
+        if abs(facing(camera, robot, side)) < math.radians(65.0)
+    }
+    read = sighting("mate", fit_pose(seen, VISION, camera))
+    corrected = without_errors(read, CameraErrors(0.0, math.log(share)), 0.0)
+    assert read.heading_rad is not None
+    assert corrected.heading_rad is not None
+    assert abs(wrap_angle(read.heading_rad - robot.heading)) > math.radians(0.3)
+    assert abs(wrap_angle(corrected.heading_rad - robot.heading)) < math.radians(0.15)

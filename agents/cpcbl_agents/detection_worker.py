@@ -1,0 +1,96 @@
+"""A detector on a thread of its own: a frame that takes long delays no step of the robot.
+
+Only the process that runs a robot uses one. In a simulation the detector works in the robot's step,
+so that the same inputs give the same bits.
+"""
+
+import threading
+from collections import Counter, deque
+from collections.abc import Callable
+from typing import TYPE_CHECKING, NamedTuple
+
+from cpcbl_agents.sources import Picture
+from cpcbl_team.inputs import Sightings
+from cpcbl_transport.messages import AnnotatedFrame, Frame
+
+if TYPE_CHECKING:  # it needs OpenCV
+    from cpcbl_agents.vision.detector import CameraDetector
+
+PATIENCE_S = 1.8  # for the thread at the end
+
+
+class DetectedFrame(NamedTuple):
+    """What a detector made of a frame: sightings, or why it cannot be used."""
+
+    stamp_ns: int
+    sightings: Sightings | str
+    annotated: AnnotatedFrame | None = None
+
+
+def detect(detector: "CameraDetector", frame: Frame | Picture, annotates: bool) -> DetectedFrame:
+    """The sightings in a frame, and the annotated frame if it `annotates`."""
+    if annotates:
+        return DetectedFrame(frame.stamp_ns, *detector.detect_and_annotate(frame))
+    return DetectedFrame(frame.stamp_ns, detector.detect(frame))
+
+
+class DetectionWorker:
+    """Detects in one frame at a time while the newest of the others waits. `wake` is called, on the
+    worker's thread, for each result."""
+
+    def __init__(self, detector: "CameraDetector", wake: Callable[[], None]) -> None:
+        self._detector, self._wake = detector, wake
+        self.counts: Counter[str] = detector.counts
+        """The detector's, after the latest result; the thread replaces them and changes none."""
+        self.problems = detector.problems
+        self._waiting: deque[tuple[Frame | Picture, bool]] = deque()
+        self._results: deque[DetectedFrame] = deque()
+        self._unfinished = 0  # frames whose results were not collected
+        self._changed, self._is_closed = threading.Condition(), False
+        self._thread = threading.Thread(target=self._run, name="detector", daemon=True)
+        self._thread.start()
+
+    @property
+    def is_busy(self) -> bool:
+        """Whether there is a frame whose result was not collected yet."""
+        return self._unfinished > 0
+
+    def submit(self, frame: Frame | Picture, annotates: bool) -> bool:
+        """One more frame; whether it takes the place of one that waits, which is skipped."""
+        with self._changed:
+            skips = bool(self._waiting)
+            self._waiting.clear()
+            self._waiting.append((frame, annotates))
+            self._changed.notify()
+        self._unfinished += not skips
+        return skips
+
+    def collect(self) -> list[DetectedFrame]:
+        """The results since the last call."""
+        with self._changed:
+            results = list(self._results)
+            self._results.clear()
+        self._unfinished -= len(results)
+        return results
+
+    def close(self) -> None:
+        """Ends the thread, after the frame at which it works."""
+        with self._changed:
+            self._is_closed = True
+            self._changed.notify()
+        self._thread.join(PATIENCE_S)
+
+    # On the thread ------------------------------------------------------------------------------
+
+    def _run(self) -> None:
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._waiting or self._is_closed)
+                if self._is_closed:
+                    return
+                frame, annotates = self._waiting.popleft()
+            result = detect(self._detector, frame, annotates)
+            self.counts, self.problems = self._detector.counts, self._detector.problems
+            with self._changed:
+                self._results.append(result)
+            self._wake()
