@@ -25,10 +25,13 @@ demo: setup
 
 test: check unit
 
-# The core and what runs in memory: no process, no Zenoh session, no camera, no experiment.
+# The core and what runs in memory: no process, no Zenoh session, no camera, no experiment; and not the
+# table of drivers' mistakes, for whoever changes agents/cpcbl_agents/input_diagnosis.
 quick: setup
 	$(BIN)/pytest -n 2 -q -m "$(USUAL) and not process" tests/core tests/net tests/transport \
-	  tests/agents tests/launch/reporting --ignore tests/agents/vision
+	  tests/agents tests/launch/reporting --ignore tests/agents/vision \
+	  --ignore tests/agents/test_driver_mistakes.py --ignore tests/agents/test_weak_motion.py \
+	  --ignore tests/agents/test_good_drivers.py
 
 check: setup
 	$(BIN)/ruff format --check
