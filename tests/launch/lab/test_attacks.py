@@ -79,5 +79,15 @@ def test_every_aim_but_those_of_poor_eyes_holds_in_twenty_seeds() -> None:
     """Two liars of four mislead a navigator for some seconds (docs/trust.md)."""
     rows = rows_of(attacks.attacks(), range(3000, 3020))
     missed = [(row.attack.name, row.attack.victim) for row in rows if not row.held]
-    missed_by_poor_eyes = {(name, "navigator") for name in ("drift", "overclaimed", "guest")}
+    missed_by_poor_eyes = {(name, "navigator") for name in ("drift", "overclaimed", "sleeper")}
     assert set(missed) <= missed_by_poor_eyes
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", ["drift", "overclaimed"])
+def test_two_liars_are_no_majority_while_a_correct_observer_does_not_see_the_navigator(
+    name: str,
+) -> None:
+    (row,) = rows_of([EVERY[name, "navigator"]], [401])[1:]
+    assert row.worst_ratio < 1.4  # 1.47 and 1.64 before
+    assert row.least_inside_3_sigma > 0.97
