@@ -33,7 +33,8 @@ from cpcbl_team.config import (
     Variant,
     Wall,
 )
-from cpcbl_team.constant_errors import INSENSITIVE
+from cpcbl_team.constant_errors import INSENSITIVE, Evidence
+from cpcbl_team.estimate import Covariance3
 from cpcbl_team.geometry import Pose2, step, wrap_angle
 from cpcbl_team.inputs import Odometry, Sightings
 from cpcbl_team.localizer import Localizer
@@ -43,6 +44,8 @@ from cpcbl_team.miscalibration import (
     Corrected,
     MapRejections,
     ModelCheck,
+    Rules,
+    adapted,
 )
 from cpcbl_team.motion import motion_noise
 from cpcbl_team.sensors import recalibrated
@@ -191,6 +194,17 @@ def test_a_variant_without_a_covariance_does_not_judge() -> None:
     state, _ = run(Truth(distance_scale=1.2), 0, "weighted")
     assert adaptation_of(state) is AS_CONFIGURED
     assert state.memory.calibration.check == ModelCheck()
+
+
+@pytest.mark.parametrize(("distance", "is_changed"), [(0.02, False), (0.04, True)])
+def test_an_error_that_is_clear_but_small_changes_nothing(
+    distance: float, is_changed: bool
+) -> None:
+    information = Covariance3(1e5, 0.0, 1e5, 0.0, 0.0, 1e5)
+    total = 1e5 * distance**2 + 40.0
+    evidence = Evidence(information, (1e5 * distance, 0.0, 0.0), total, parts=40.0)
+    changed = adapted(ModelCheck(evidence=evidence), AS_CONFIGURED, 100, Rules(0.999))
+    assert (changed is not None) is is_changed
 
 
 def misplaced_in(state: State) -> str:
