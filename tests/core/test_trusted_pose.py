@@ -23,7 +23,16 @@ from support.core import (
 from cpcbl_team.config import SensorSettings
 from cpcbl_team.geometry import Pose2, wrap_angle
 from cpcbl_team.inputs import Sighting
-from cpcbl_team.sensor_mistakes import FOOT_M, HALF_OFF, IN_FEET, MIRRORED, QUARTER_OFF
+from cpcbl_team.relocalization import readings_of
+from cpcbl_team.sensor_mistakes import (
+    FOOT_M,
+    HALF_OFF,
+    IN_FEET,
+    LEAST_READINGS,
+    MIRRORED,
+    QUARTER_OFF,
+    mistake_in_evidence,
+)
 from cpcbl_team.state import State
 from cpcbl_team.trusted_pose import OR_MOVED
 
@@ -81,6 +90,20 @@ def test_a_mistake_is_named_at_once_and_moves_nothing(
     assert position_error(state.estimate, truth) < 0.4
     assert heading_error(state.estimate, truth) < 0.3
     assert "found_again" not in state.counts
+
+
+def test_evidence_that_fits_as_it_is_needs_no_mistake() -> None:
+    """A landmark straight ahead looks the same to mirrored bearings."""
+    corner = CORNERS.landmarks["ne"]
+    ahead = math.atan2(corner.y_m - LOOP_START.y, corner.x_m - LOOP_START.x)
+    begin = Pose2(LOOP_START.x, LOOP_START.y, ahead)
+    robot = localizer()
+    *_, (state, _) = followed(
+        robot, state_at(begin, diagonal(0.1, 0.1)), begin, STAND, names=lambda _: ("ne",)
+    )
+    evidence = robot.recovery.evidence(state.memory.recovery)
+    assert sum(map(readings_of, evidence)) >= LEAST_READINGS
+    assert mistake_in_evidence(state.estimate, evidence, state.odometry_from_robot) is None
 
 
 def test_a_mended_driver_is_believed_again() -> None:
