@@ -396,6 +396,5 @@ def _usable(frame: Sightings) -> Sightings:
         if -LARGEST_ANGLE <= (s.bearing_rad or 0.0) <= LARGEST_ANGLE
         and -LARGEST_NUMBER <= (s.range_m or 0.0) <= LARGEST_NUMBER
     ]
-    if len(usable) == len(frame.sightings):
-        return frame
-    return Sightings(frame.stamp_ns, tuple(usable))
+    is_whole = len(usable) == len(frame.sightings)
+    return frame if is_whole else Sightings(frame.stamp_ns, tuple(usable))
