@@ -130,7 +130,8 @@ def test_what_a_robot_did_is_known_more_coarsely_in_a_long_run() -> None:
 def test_problems_with_free_names_in_them_are_bounded() -> None:
     log = ProblemLog()
     for n in range(MOST_PROBLEMS + 50):
-        log.add(status("r1", problems=(f"`{'x' * (n + 1)}` is no landmark",)))
+        text = f"`{'x' * (n + 1)}` is no landmark"
+        log.add(status("r1", problems=(text,), unconfirmed=""))
     assert len(log.reports) == MOST_PROBLEMS
 
 

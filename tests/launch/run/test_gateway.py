@@ -347,7 +347,7 @@ def test_a_stream_takes_inputs_and_gives_poses() -> None:
 def test_a_slow_reader_loses_poses_and_gets_the_newest(monkeypatch: pytest.MonkeyPatch) -> None:
     # A client that does not read answers no ping: on a busy machine it would be cut off meanwhile
     monkeypatch.setattr(server, "HEARTBEAT_S", 600.0)
-    last = 10_000
+    last = 20_000
 
     async def check(stand: Stand) -> None:
         robot = stand.bus.publisher(topics.POSE.at(robot="me"), topics.POSE.qos)
