@@ -46,6 +46,7 @@ class DetectionWorker:
         self._waiting: deque[tuple[Frame | Picture, bool]] = deque()
         self._results: deque[DetectedFrame] = deque()
         self._unfinished = 0  # frames whose results were not collected
+        self._failure: Exception | None = None
         self._changed, self._is_closed = threading.Condition(), False
         self._thread = threading.Thread(target=self._run, name="detector", daemon=True)
         self._thread.start()
@@ -66,7 +67,10 @@ class DetectionWorker:
         return skips
 
     def collect(self) -> list[DetectedFrame]:
-        """The results since the last call."""
+        """The results since the last call. Raises what the detector raised on the thread: it takes
+        bad frames, so that is an error of this program, which must not leave the robot blind."""
+        if self._failure is not None:
+            raise self._failure
         with self._changed:
             results = list(self._results)
             self._results.clear()
@@ -89,7 +93,12 @@ class DetectionWorker:
                 if self._is_closed:
                     return
                 frame, annotates = self._waiting.popleft()
-            result = detect(self._detector, frame, annotates)
+            try:
+                result = detect(self._detector, frame, annotates)
+            except Exception as error:
+                self._failure = error
+                self._wake()
+                return
             self.counts, self.problems = self._detector.counts, self._detector.problems
             with self._changed:
                 self._results.append(result)

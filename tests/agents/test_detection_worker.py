@@ -40,6 +40,8 @@ class SlowDetector:
         self.begun.release()
         assert self.may.acquire(timeout=LONG_S)
         self.counts = self.counts + Counter(bad_fit=1)
+        if frame.image == b"bug":
+            raise ZeroDivisionError
         if not frame.image:
             return "frame_empty"
         return Sightings(frame.stamp_ns, (Sighting("north", 1.0, 0.0),))
@@ -144,6 +146,12 @@ def test_a_refused_frame_and_an_annotated_one_come_back_too(watched: Watched) ->
     (annotated,) = watched.next_result()
     assert isinstance(annotated, AnnotatedFrame)
     assert watched.agent.refused == {"frame_empty": 1}
+
+
+def test_an_error_of_the_detector_itself_ends_the_robot_as_in_its_step(watched: Watched) -> None:
+    watched.frame(1.0, b"bug")
+    with pytest.raises(ZeroDivisionError):
+        watched.next_result()
 
 
 def test_without_a_thread_the_step_waits_and_a_robot_without_a_camera_needs_none() -> None:
