@@ -135,9 +135,7 @@ class TeammateScreen:
         dependent = observation.dependent
         sums = observation.information(observation.noise(0.0))
         variance = 0.5 * (dependent.xx + dependent.yy)
-        own = state.estimate.covariance
-        dependent = Covariance2(variance, 0.0, variance)
-        return OffsetEvidence(sums, dependent, own.hh, own.xx + own.yy)
+        return _evidence_at(state, sums, Covariance2(variance, 0.0, variance))
 
     def screen_observation(
         self, state: State, observation: PoseObservation, position: Observation, nis: float
@@ -152,8 +150,7 @@ class TeammateScreen:
             if self.has_recent_reports(state, now) and not is_lost:
                 is_accepted = nis <= self._gates[1]
                 sums = position.information(position.noise(0.0))
-                prior = state.estimate.covariance
-                own = OffsetEvidence(sums, NOTHING, prior.hh, prior.xx + prior.yy)
+                own = _evidence_at(state, sums)
                 state = self._with_own_sensors(state, is_accepted, not is_accepted, own)
             return state, True
         heading, of_heading = observation.of_heading(state.estimate.pose), None
@@ -226,12 +223,17 @@ class TeammateScreen:
         return with_teammates(state, teammates), decision.trusted
 
 
+def _evidence_at(state: State, sums: Sums, dependent: Covariance2 = NOTHING) -> OffsetEvidence:
+    """Sums about the offset of the state's estimate, with the variances of that."""
+    c = state.estimate.covariance
+    return OffsetEvidence(sums, dependent, c.hh, c.xx + c.yy)
+
+
 def _own_offset(state: State, sums: Information, accepted: Iterable[GatedObject]) -> OffsetEvidence:
     """What the robot's own sensors say of the offset of the estimate in one frame."""
-    common, own = state.common_errors, state.estimate.covariance
-    variance, of_position = own.hh, own.xx + own.yy
+    common, variance = state.common_errors, state.estimate.covariance.hh
     if common is None:
-        return OffsetEvidence(sums, NOTHING, variance, of_position)
+        return _evidence_at(state, sums)
     of_yaw = of_focal = Information.none()
     for found in accepted:
         if not found.measurement.is_teammate:
@@ -249,8 +251,7 @@ def _own_offset(state: State, sums: Information, accepted: Iterable[GatedObject]
         ay * ay * yy + 2.0 * ay * by * yf + by * by * ff,
     )
     position = _without_heading(sums, variance)
-    evidence = OffsetEvidence(position, dependent, variance, of_position)
-    return evidence.weighted(INDEPENDENT_FRAMES)
+    return _evidence_at(state, position, dependent).weighted(INDEPENDENT_FRAMES)
 
 
 def _with_camera(state: State, m: Measurement, evidence: OffsetEvidence) -> OffsetEvidence:

@@ -126,8 +126,8 @@ class Status(msgspec.Struct, frozen=True, array_like=True, tag="status"):
     problems: tuple[str, ...] = ()
     """What is wrong with the inputs, as sentences for people, the worst first."""
     unconfirmed: str = ""
-    """What nothing confirms about a pose that was found without a known start, and why; the state
-    is then not ok. Empty while the robot is lost."""
+    """What is not confirmed about the pose, and why; the state is then not ok. Empty while the
+    robot is lost."""
 
 
 class Track(msgspec.Struct, frozen=True, array_like=True, tag="track"):
@@ -151,8 +151,8 @@ class Pose(msgspec.Struct, frozen=True, array_like=True, tag="pose"):
 
     `stamp_ns`: the time for which it holds, that of the newest odometry. `covariance`: rows of x, y
     and heading (m^2, m rad, rad^2); None where the variant has none. `lost`: why the robot is lost,
-    empty while it is not; the pose of a lost robot is not to be used. `unconfirmed`: what nothing
-    confirms about a pose that was found without a known start, and why; else empty.
+    empty while it is not; the pose of a lost robot is not to be used. `unconfirmed`: what is
+    not confirmed about the pose, and why; else empty.
     """
 
     robot: Name

@@ -18,7 +18,9 @@ FAR_M: Final = 3.0  # driven, and
 LONG_NS: Final = 10_000_000_000  # for so long nothing was wrong: that is enough
 CLEAR_M: Final = 1.0  # in all: landmarks should have shown it,
 DRIVEN_M: Final = 0.05  # and below, the robot stands or turns on the spot
+TURNING_RAD: Final = 0.05  # in all: below, it stands
 TURNED_RAD: Final = 1.0  # in all: mirrored bearings would have shown
+ORDER_FRAMES: Final = 20  # the latest, in which landmarks stand in the order of the map or not
 MOST_REJECTED: Final = 6  # of the latest 20 innovations; right drivers seldom have more
 _REMEDY: Final = "drive it past landmarks, or state its start"
 
@@ -45,9 +47,8 @@ class PoseConfirmation:
         self._moves = moves
         self._jump_ns = -1
         self._begin(now_ns)
-        self._has_seen = False
+        self._has_seen: bool | None = None  # a landmark; None until it is judged
         self._missing = "" if is_start_known else self._text(False)
-        self._sees_landmarks = True  # until it is judged
 
     @property
     def is_awaited(self) -> bool:
@@ -58,7 +59,7 @@ class PoseConfirmation:
     def reason(self) -> str:
         """What is not confirmed, and what confirms it. Empty if nothing is missing, and for a robot
         that has seen no landmark: its pose is not from its bearings."""
-        return self._missing if self._sees_landmarks else ""
+        return "" if self._has_seen is False else self._missing
 
     def judge(self, facts: InputFacts, jump: Jump | None, is_wrong: bool, now_ns: int) -> None:
         """To be called with each judgement of the inputs while the pose is not confirmed.
@@ -74,9 +75,9 @@ class PoseConfirmation:
             self._begin(now_ns)
         self._add_motion(facts)
         frames = [f for f in facts.long_frames if f.stamp_ns > self._since_ns]
-        self._has_seen |= any(s.id in facts.landmarks for f in frames for s in f.sightings)
-        self._sees_landmarks = self._has_seen
-        order_is_right = is_order_right(frames[-20:], facts.landmarks)
+        sees = any(s.id in facts.landmarks for f in frames for s in f.sightings)
+        self._has_seen = self._has_seen or sees
+        order_is_right = is_order_right(frames[-ORDER_FRAMES:], facts.landmarks)
         is_far = self._way_m > FAR_M and now_ns - self._since_ns > LONG_NS
         if self._is_confirmed(facts, order_is_right) or (self._moves and is_far):
             self._missing = ""
@@ -112,7 +113,7 @@ class PoseConfirmation:
             why = "landmarks do not show clearly yet how the robot moves"
         elif self._way_m > DRIVEN_M:
             why = "the robot has hardly driven so far"
-        elif self._turned_rad > DRIVEN_M:
+        elif self._turned_rad > TURNING_RAD:
             why = "the robot has only turned on the spot so far"
         else:
             why = "the robot has not driven so far"

@@ -82,6 +82,11 @@ class ProblemReport(msgspec.Struct, frozen=True, kw_only=True):
 MOST_PROBLEMS = 100  # of one robot; they may have free names in them
 
 
+def shortcomings(status: Status) -> tuple[str, ...]:
+    """The problems of a robot, and what is not confirmed about its pose."""
+    return (*status.problems, *filter(None, [status.unconfirmed]))
+
+
 class ProblemLog:
     """The problems of one robot over a run, by its statuses; also what is not confirmed about its
     pose at the end."""

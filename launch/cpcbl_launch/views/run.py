@@ -20,6 +20,7 @@ from cpcbl_launch.reporting.statuses import (
     miscalibration_text,
     misplaced_objects,
     problem_remarks,
+    shortcomings,
     trust_remarks,
 )
 from cpcbl_launch.reporting.tables import number, percent, short, table, times
@@ -62,7 +63,7 @@ class LiveTable(LiveView):
         lines = [
             f"{name}: {text}"
             for name, s in recorder.latest()[1].items()
-            for text in (*s.problems, *filter(None, [s.unconfirmed]))
+            for text in shortcomings(s)
         ]
         return Group(shown, *(Text(line, "yellow") for line in lines))
 

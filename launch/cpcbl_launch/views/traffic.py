@@ -17,6 +17,7 @@ from cpcbl_launch.reporting.statuses import (
     FlowReport,
     SpendingReport,
     TrustReport,
+    shortcomings,
     summed_flows,
     summed_spending,
     trust_reports,
@@ -122,7 +123,7 @@ def _live_robot(arrivals: Sequence[Arrival], now_s: float) -> LiveRobot:
         heard=tuple(_live_flows(first, last, first.heard, last.heard)),
         spending=summed_spending([last.spending]),
         trust=trust_reports([last]),
-        problems=(*last.problems, *filter(None, [last.unconfirmed])),
+        problems=shortcomings(last),
     )
 
 

@@ -3,7 +3,9 @@
 import io
 import time
 from collections.abc import Callable
+from typing import Any
 
+import msgspec
 import pytest
 from rich.console import Console, RenderableType
 from support.buses import SECOND
@@ -61,26 +63,25 @@ def drawn(console: Console, table: Callable[..., RenderableType], recorder: Reco
     return capture.get()
 
 
-def test_a_robot_with_a_problem_is_not_ok_in_the_live_table() -> None:
+@pytest.mark.parametrize(
+    ("state", "key", "wrong", "right", "text"),
+    [
+        ("problem", "problems", (SILENT,), (), SILENT),
+        ("unconfirmed", "unconfirmed", UNCONFIRMED, "", UNCONFIRMED),
+    ],
+)
+def test_a_robot_with_a_problem_or_an_unconfirmed_pose_is_not_ok_in_the_live_table(
+    state: str, key: str, wrong: Any, right: Any, text: str
+) -> None:
     table = Table()
     table.tracks(SECOND, "r1", "r2")
-    for name, problems in (("r1", (SILENT,)), ("r2", ())):
-        table.put(topics.STATUS.at(robot=name), status(name, 1.0, 3, problems=problems))
+    for name, value in (("r1", wrong), ("r2", right)):
+        message = msgspec.structs.replace(status(name, 1.0, 3), **{key: value})
+        table.put(topics.STATUS.at(robot=name), message)
     rows = table.rows()
-    assert rows["r1"].endswith("problem")
+    assert rows["r1"].endswith(state)
     assert rows["r2"].endswith("ok")
-    assert rows["r1:"] == f"r1: {SILENT}"
-
-
-def test_a_robot_whose_pose_is_not_confirmed_is_not_ok() -> None:
-    table = Table()
-    table.tracks(SECOND, "r1", "r2")
-    for name, unconfirmed in (("r1", UNCONFIRMED), ("r2", "")):
-        table.put(topics.STATUS.at(robot=name), status(name, 1.0, 3, unconfirmed=unconfirmed))
-    rows = table.rows()
-    assert rows["r1"].endswith("unconfirmed")
-    assert rows["r2"].endswith("ok")
-    assert rows["r1:"] == f"r1: {UNCONFIRMED}"
+    assert rows["r1:"] == f"r1: {text}"
 
 
 def test_a_report_says_what_is_not_confirmed_at_the_end() -> None:
