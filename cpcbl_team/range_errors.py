@@ -13,9 +13,12 @@ linear enough to be used: chosen by their own noise, distances would be too shor
 
 import math
 from collections.abc import Mapping, Sequence
+from math import cos, sin
 from typing import Final, NamedTuple
 
 from cpcbl_team.geometry import new
+
+_hypot: Final = math.hypot  # see `constraints._atan2`
 
 FADING: Final = 1.0 - 1.0 / 500.0  # of all sums, a frame
 PRIOR_SHARE: Final = 0.05  # sigmas; the two errors look alike, and each takes its part. Wider ones
@@ -103,7 +106,8 @@ class PairGeometry(NamedTuple):
     across: float  # the variance (m^2) of both landmarks across the line between them
 
     def plus(self, last: "PairGeometry") -> "PairGeometry":
-        (per_bias, across), (last_bias, last_across) = self, last
+        per_bias, across = self
+        last_bias, last_across = last
         per_bias += LAST_SHARE * (last_bias - per_bias)
         across += LAST_SHARE * (last_across - across)
         return new(PairGeometry, (per_bias, across))
@@ -132,6 +136,7 @@ class FadedFit:
 
 
 NO_FIT: Final = Fit()
+NOTHING: Final = (0.0, 0.0, 0.0, 0.0, 0.0)
 _NONE: Final[Mapping[str, Fit]] = {}
 _NO_PAIRS: Final[Mapping[tuple[str, str], PairGeometry]] = {}
 
@@ -159,15 +164,15 @@ class RangeEvidence(NamedTuple):
         landmarks = [SeenLandmark(seen) for seen in sorted(frame)]
         for i, one in enumerate(landmarks):
             for other in landmarks[i + 1 :]:
-                found = _distance_error(one, other)
-                if found is None:
+                error, s, variance, b, across = _distance_error(one, other)
+                if variance == 0.0:
                     continue
-                error, s, variance, last = found
-                pair = one.name, other.name
+                pair, last = (one.name, other.name), new(PairGeometry, (b, across))
                 before = geometry_before.get(pair)
-                geometry[pair] = last if before is None else before.plus(last)
                 if before is None:
+                    geometry[pair] = last
                     continue
+                geometry[pair] = before.plus(last)
                 b, across = before
                 if across > CURVED * s * s:
                     continue
@@ -175,10 +180,11 @@ class RangeEvidence(NamedTuple):
                 squares, pairs = squares + w * error**2, pairs + weight
                 total.add(w, s, b, error)
                 for name in pair:
-                    if name not in of_object:
-                        of_object[name] = FadedFit(NO_FIT)
-                    of_object[name].add(w, s, b, error)
-        fits = {name: of_one.fit() for name, of_one in of_object.items()}
+                    of_one = of_object.get(name)
+                    if of_one is None:
+                        of_one = of_object[name] = FadedFit(NO_FIT)
+                    of_one.add(w, s, b, error)
+        fits = {name: one_fit.fit() for name, one_fit in of_object.items()}
         return new(RangeEvidence, (total.fit(), squares, pairs, fits, geometry))
 
     def errors(self, present: RangeErrors, independent_share: float) -> RangeErrors:
@@ -216,20 +222,20 @@ class SeenLandmark:
     def __init__(self, seen: Seen) -> None:
         name, map_x, map_y, range_m, bearing, range_sigma_m, bearing_sigma = seen
         self.name, self.map_x, self.map_y, self.range_m = name, map_x, map_y, range_m
-        self.x, self.y = range_m * math.cos(bearing), range_m * math.sin(bearing)
+        self.x, self.y = range_m * cos(bearing), range_m * sin(bearing)
         self.of_range, self.of_bearing = range_sigma_m**2, (range_m * bearing_sigma) ** 2
 
 
 def _distance_error(
     one: SeenLandmark, other: SeenLandmark
-) -> tuple[float, float, float, PairGeometry] | None:
+) -> tuple[float, float, float, float, float]:
     """By how much the distance between two landmarks is read too short (m), what a share of one
-    makes of it, its variance (m^2), and how the pair was seen; None if nothing can be said."""
-    distance = math.hypot(other.map_x - one.map_x, other.map_y - one.map_y)
+    makes of it, its variance (m^2; 0: nothing can be said), and how the pair was seen."""
+    distance = _hypot(other.map_x - one.map_x, other.map_y - one.map_y)
     dx, dy = other.x - one.x, other.y - one.y
-    read = math.hypot(dx, dy)
+    read = _hypot(dx, dy)
     if read == 0.0:
-        return None
+        return NOTHING
     along_x, along_y = dx / read, dy / read
     of_one = (one.x * along_x + one.y * along_y) / one.range_m
     of_other = (other.x * along_x + other.y * along_y) / other.range_m
@@ -239,7 +245,7 @@ def _distance_error(
     variance += c_other * other.of_range + s_other * other.of_bearing
     across = s * one.of_range + c * one.of_bearing
     across += s_other * other.of_range + c_other * other.of_bearing
-    if distance == 0.0 or variance == 0.0:
-        return None
+    if distance == 0.0:
+        return NOTHING
     error = distance - (read - 0.5 * across / distance)
-    return error, distance, variance, new(PairGeometry, (of_other - of_one, across))
+    return error, distance, variance, of_other - of_one, across
