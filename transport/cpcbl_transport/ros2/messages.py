@@ -1,6 +1,6 @@
 """Messages of ROS 2: their classes, their type hashes, and their bytes (CDR).
 
-The work is that of `rosbags`, which this file alone imports, and late: it takes 0.2 s. A message is
+The work is that of `rosbags`, which is imported late: it takes 0.2 s. A message is
 a dataclass of rosbags with the fields of its definition; arrays of numbers are numpy arrays (which
 may not be written to after decoding), other sequences are lists.
 
@@ -14,7 +14,7 @@ from functools import cache
 from typing import TYPE_CHECKING, Any
 
 from cpcbl_team.errors import DependencyError
-from cpcbl_transport.ros2.definitions import APRILTAG_AND_VISION
+from cpcbl_transport.ros2.definitions import APRILTAG_AND_VISION, new_message
 from cpcbl_transport.ros2.names import NO_TYPE_HASH, Distribution, RosNameError, type_name
 
 if TYPE_CHECKING:
@@ -72,6 +72,16 @@ class MessageTypes:
     def classes(self) -> Mapping[str, Any]:
         """The class of each type: `classes["geometry_msgs/msg/Point"](x=1.0, y=2.0, z=0.0)`."""
         return self._store.types
+
+    def new(self, name: str, **fields: Any) -> Message:
+        """A message of a type: these fields, and for all others zero or nothing (a quaternion is
+        no rotation). Raises KeyError for a type that is not known, TypeError for a field."""
+        message = new_message(self._store, name)
+        for field, value in fields.items():
+            if not hasattr(message, field):
+                raise TypeError(f"{name} has no field {field!r}")
+            setattr(message, field, value)
+        return message
 
     def require(self, name: str) -> str:
         """The full name of a type of this distribution. Raises RosNameError for another one."""
