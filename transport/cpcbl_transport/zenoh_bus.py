@@ -1,4 +1,5 @@
-"""The bus over Zenoh: the only file that imports Zenoh. Its choices come from measurements.
+"""The bus over Zenoh: besides `ros2/session.py` the only file that imports Zenoh. Its choices come
+from measurements.
 
 - There is one publisher for each concrete key: Zenoh uploads a put without a publisher even if
   nobody subscribes.
@@ -54,6 +55,20 @@ def open_bus(
     credentials every link is mutual TLS. `on_wait` is told again and again that there is none yet,
     with the reason where TLS has one; without it the log says so. Without a team, keys are whole
     ones, of all teams. Raises BusError when it gave up.
+    """
+    space = namespace(team) if team else None
+    return ZenohBus(open_session(connect, client_config, space, give_up, credentials, on_wait))
+
+
+def open_session(
+    connect: Sequence[str],
+    config_of: Callable[[Sequence[str], Credentials | None], Mapping[str, Any]] = client_config,
+    space: str | None = None,
+    give_up: Callable[[], bool] = lambda: False,
+    credentials: Credentials | None = None,
+    on_wait: Callable[[str], None] | None = None,
+) -> "zenoh.Session":
+    """A session that connects to a router, as `open_bus` says, below a namespace of keys.
 
     Each attempt begins with another endpoint: one that accepts and says nothing, or is far behind
     with its handshakes, takes all the time of an attempt.
@@ -62,10 +77,10 @@ def open_bus(
     reason, said_s, first = "stopped before a router answered", -WAITING_S, True
     begin_with = deque(connect)
     while not give_up():
-        config = client_config(begin_with, credentials)
+        config = config_of(begin_with, credentials)
         begin_with.rotate(-1)
         try:
-            return ZenohBus(_open(config, namespace(team) if team else None))
+            return _open(config, space)
         except zenoh.ZError as error:
             reason = _tls_reason(connect, credentials) or one_line(str(error))
             if on_wait is not None:
