@@ -63,6 +63,13 @@ class Ros2Settings(Table, frozen=True, kw_only=True):
     """The AprilTags at landmarks, by the landmark's name. Those on robots are `markers`."""
     datum: Datum | None = None
 
+    def topic(self, robot: str, topic: str) -> str:
+        """A topic of a robot without its first slash: in its namespace, unless it is absolute."""
+        if topic.startswith("/"):
+            return topic.lstrip("/")
+        space = self.namespace.replace("{robot}", robot).strip("/")
+        return f"{space}/{topic}" if space else topic
+
 
 class Ros2RobotSettings(Table, frozen=True, kw_only=True):
     """The topics and frames of one robot. A topic that begins with a slash is absolute, any other

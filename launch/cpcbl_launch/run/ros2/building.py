@@ -1,29 +1,24 @@
 """Messages of ROS 2 from dictionaries: what a dictionary leaves out is zero, empty or false."""
 
 import dataclasses
-import re
-from collections.abc import Mapping
 from functools import lru_cache
 from typing import Any
 
 import numpy as np
 
 from cpcbl_launch.run.ros2.planar import Fields
-
-_PLAIN: dict[str, Any] = {"int": 0, "float": 0.0, "str": "", "bool": False}
-_DTYPE = re.compile(r"np\.dtype\[np\.(\w+)\]")
+from cpcbl_transport.ros2.messages import Message, MessageTypes
 
 
-def build_message(classes: Mapping[str, Any], name: str, fields: Fields) -> Any:
-    """The message of a type. `classes`: those of all types by name, which are dataclasses; an array
-    of fixed length must be in `fields`. Raises ValueError for a field that the type does not have.
-    """
-    kinds = _kinds(classes[name])
-    if unknown := fields.keys() - kinds.keys():
-        raise ValueError(f"{name} has no field {', '.join(sorted(unknown))}")
-    return classes[name](
-        **{field: _value(classes, kind, fields.get(field)) for field, kind in kinds.items()}
-    )
+def build_message(types: MessageTypes, name: str, fields: Fields) -> Message:
+    """The message of a type. Raises TypeError for a field that the type does not have."""
+    message = types.new(name)
+    kinds = _kinds(type(message))  # type: ignore[arg-type]  # a class can be hashed
+    for field, given in fields.items():
+        if field not in kinds:
+            raise TypeError(f"{name} has no field {field!r}")
+        setattr(message, field, _value(types, kinds[field], given, getattr(message, field)))
+    return message
 
 
 @lru_cache(maxsize=256)
@@ -32,11 +27,11 @@ def _kinds(message_class: Any) -> dict[str, str]:
     return {field.name: str(field.type) for field in dataclasses.fields(message_class)}
 
 
-def _value(classes: Mapping[str, Any], kind: str, given: Any) -> Any:
-    if kind in _PLAIN:
-        return _PLAIN[kind] if given is None else given
-    if found := _DTYPE.search(kind):
-        return np.asarray([] if given is None else given, dtype=found[1])
-    if kind.startswith("list["):
-        return [_value(classes, kind[5:-1], one) for one in given or ()]
-    return build_message(classes, kind.replace("__", "/"), given or {})
+def _value(types: MessageTypes, kind: str, given: Any, default: Any) -> Any:
+    if isinstance(given, dict):
+        return build_message(types, kind.replace("__", "/"), given)
+    if isinstance(default, np.ndarray):
+        return np.asarray(given, dtype=default.dtype)
+    if isinstance(given, list) and kind.startswith("list["):
+        return [_value(types, kind[5:-1], one, None) for one in given]
+    return given

@@ -38,7 +38,6 @@ class InputTopic(NamedTuple):
     topic: str
     type_name: str
     take: Take
-    is_required: bool = False
 
 
 class RobotInputs:
@@ -62,7 +61,7 @@ class RobotInputs:
         self.lock = threading.Lock()
         """Of the odometry and the stamps."""
         self._tag_lock = threading.Lock()
-        topic = full_topic(team, name, settings.ros2.odometry)
+        topic = team.ros2.topic(name, settings.ros2.odometry)
         field_frame = team.ros2.field_frame
         note = partial(refusals.add, topic)
         self.odometry = OdometryInput(settings.ros2, field_frame, note)
@@ -82,28 +81,32 @@ class RobotInputs:
         """The topics to subscribe to, each with the function that takes its messages."""
         keys, own = self._settings.ros2, self._settings
         rows = [
-            InputTopic(keys.odometry, types.ODOMETRY, self._take_odometry, True),
-            InputTopic(keys.ranges, types.RANGE, self._take_range, True),
-            InputTopic(keys.detections_3d, types.DETECTIONS, self._take_detections_3d, True),
-            InputTopic(keys.position, types.POSE, self._take_position, True),
+            InputTopic(keys.odometry, types.ODOMETRY, self._take_odometry),
+            InputTopic(keys.ranges, types.RANGE, self._take_range),
+            InputTopic(keys.detections_3d, types.DETECTIONS, self._take_detections_3d),
+            InputTopic(keys.position, types.POSE, self._take_position),
         ]
         if self._ros2.datum is not None:
-            rows.append(InputTopic(keys.navsat, types.NAV_SAT_FIX, self._take_fix, True))
+            rows.append(InputTopic(keys.navsat, types.NAV_SAT_FIX, self._take_fix))
         if own.sensing == "camera":
             rows += [
-                InputTopic(keys.image, types.IMAGE, self._take_image, True),
-                InputTopic(keys.compressed_image, types.COMPRESSED_IMAGE, self._take_jpeg, True),
+                InputTopic(keys.image, types.IMAGE, self._take_image),
+                InputTopic(keys.compressed_image, types.COMPRESSED_IMAGE, self._take_jpeg),
             ]
         elif keys.detections:
             rows += [
-                InputTopic(keys.detections, types.APRIL_TAGS, self._take_tags, True),
-                InputTopic(keys.camera_info, types.CAMERA_INFO, self._take_camera_info, True),
+                InputTopic(keys.detections, types.APRIL_TAGS, self._take_tags),
+                InputTopic(keys.camera_info, types.CAMERA_INFO, self._take_camera_info),
             ]
         found = [row for row in rows if row.topic and self._is_wanted(row)]
-        return [row._replace(topic=full_topic(self._team, self._name, row.topic)) for row in found]
+        return [row._replace(topic=self._ros2.topic(self._name, row.topic)) for row in found]
 
     def _is_wanted(self, row: InputTopic) -> bool:
-        return row.type_name != types.ODOMETRY or self._settings.odometry.moves
+        """Whether the team file gives the topic a meaning."""
+        if row.type_name == types.ODOMETRY:
+            return self._settings.odometry.moves
+        is_of_tags = row.type_name in (types.APRIL_TAGS, types.CAMERA_INFO)
+        return has_tags(self._team) or not is_of_tags
 
     def on_message(self, row: InputTopic, message: Any) -> None:
         """Takes a message of a topic. Raises nothing: nobody can show it every message."""
@@ -160,7 +163,7 @@ class RobotInputs:
         if self._tags is None:
             from cpcbl_launch.run.ros2.tags_in import TagInput
 
-            topic = full_topic(self._team, self._name, self._settings.ros2.detections)
+            topic = self._ros2.topic(self._name, self._settings.ros2.detections)
             note = partial(self._refusals.add, topic)
             self._tags = TagInput(self._name, self._team, note)
         return self._tags
@@ -168,7 +171,7 @@ class RobotInputs:
     def _take_detections_3d(
         self, message: Any, team_ns: int, ros_ns: int
     ) -> Sightings | Refused | None:
-        topic = full_topic(self._team, self._name, self._settings.ros2.detections_3d)
+        topic = self._ros2.topic(self._name, self._settings.ros2.detections_3d)
         note = partial(self._refusals.add, topic)
         names, settings = self._names, self._settings
         found = sensors_in.sightings_of_detections(message, team_ns, settings, names, note)
@@ -229,13 +232,9 @@ class RobotInputs:
         return found
 
 
-def full_topic(team: Team, robot: str, topic: str) -> str:
-    """A topic of a robot without its first slash: in its namespace, unless it is absolute."""
-    if topic.startswith("/"):
-        return topic.lstrip("/")
-    assert team.ros2 is not None
-    space = team.ros2.namespace.replace("{robot}", robot).strip("/")
-    return f"{space}/{topic}" if space else topic
+def has_tags(team: Team) -> bool:
+    """Whether a robot carries markers, or a landmark has a tag."""
+    return bool(team.ros2 and team.ros2.tags) or any(r.markers for r in team.robots.values())
 
 
 def _if_any(found: Sightings | Refused) -> Sightings | Refused | None:

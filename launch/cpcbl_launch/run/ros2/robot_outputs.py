@@ -1,7 +1,6 @@
 """What the team gives to the topics of one robot in ROS 2: its pose and its transforms."""
 
 from collections.abc import Callable
-from typing import Any, Protocol
 
 from cpcbl_launch.run.ros2.building import build_message
 from cpcbl_launch.run.ros2.odometry_in import TrackPoint
@@ -12,39 +11,25 @@ from cpcbl_launch.run.ros2.poses_out import (
     pose_message,
     transform_message,
 )
-from cpcbl_launch.run.ros2.robot_inputs import RobotInputs, full_topic
+from cpcbl_launch.run.ros2.robot_inputs import RobotInputs
 from cpcbl_team.config import Team
 from cpcbl_transport.messages import Pose
 from cpcbl_transport.ros2 import messages as types
+from cpcbl_transport.ros2.node import RosNode
 
 TRANSFORM_NS = 20_000_000  # between two transforms odometry -> robot
 
 
-class RosPublisher(Protocol):
-    """A publisher of one topic of ROS 2."""
-
-    def publish(self, message: Any) -> None: ...
-
-
-class RosNode(Protocol):
-    """The bridge's node in ROS 2, as far as outputs need it."""
-
-    @property
-    def classes(self) -> Any: ...
-
-    def publisher(self, topic: str, type_name: str) -> RosPublisher: ...
-
-
 class Output:
-    """One topic that takes dictionaries."""
+    """One topic of ROS 2 that takes dictionaries."""
 
     def __init__(self, node: RosNode, topic: str, type_name: str) -> None:
-        self._classes, self._type_name = node.classes, type_name
+        self._types, self._type_name = node.types, type_name
         self._publisher = node.publisher(topic, type_name)
 
     def put(self, fields: Fields) -> None:
         """Publishes a message with these fields."""
-        self._publisher.publish(build_message(self._classes, self._type_name, fields))
+        self._publisher.publish(build_message(self._types, self._type_name, fields))
 
 
 class RobotOutputs:
@@ -54,7 +39,7 @@ class RobotOutputs:
     def __init__(self, name: str, team: Team, node: RosNode, inputs: RobotInputs | None) -> None:
         """`inputs`: its odometry, if this bridge has it; without it there is no transform."""
         assert team.ros2 is not None
-        self._ros2, self._inputs = team.ros2, inputs
+        self._ros2, self._inputs = ros2, inputs = team.ros2, inputs
         settings = team.robots[name]
         self._keys = keys = settings.ros2
         self._delay_ns = int(settings.odometry.delay_s * 1e9)
@@ -62,7 +47,7 @@ class RobotOutputs:
         def output(topic: str, type_name: str) -> Callable[[Fields], None]:
             if not topic:
                 return lambda fields: None
-            return Output(node, full_topic(team, name, topic), type_name).put
+            return Output(node, ros2.topic(name, topic), type_name).put
 
         has_odometry = inputs is not None and settings.odometry.moves
         self._pose = output(keys.pose, types.POSE)
