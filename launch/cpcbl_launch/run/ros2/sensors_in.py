@@ -91,6 +91,8 @@ def frame_of_image(message: Any, stamp_ns: int) -> Frame | Refused:
     if encoding.startswith("rgb"):
         code = cv2.COLOR_RGB2BGR if channels == 3 else cv2.COLOR_RGBA2BGR
         pixels = np.asarray(cv2.cvtColor(pixels, code), np.uint8)
+    elif channels == 1:  # the robot's detector needs three
+        pixels = np.asarray(cv2.cvtColor(pixels, cv2.COLOR_GRAY2BGR), np.uint8)
     _, jpeg = cv2.imencode(".jpg", pixels[..., :3], [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
     return _bounded(Frame(stamp_ns, jpeg.tobytes()))
 

@@ -88,7 +88,7 @@ def test_binning_and_region_of_the_camera_count() -> None:
     roi = {"x_offset": 100, "y_offset": 40, "width": 500, "height": 400}
     own, said = ready(team, camera_info(binning_x=2, binning_y=2, roi=roi))
     corners = corners_of(team, true_camera(team), "door", "front", DOOR)
-    seen = own.take(detections(T0, detection(7, (corners - [100.0, 40.0]) / 2.0)), T0)
+    seen = own.take(detections(T0, detection(7, (corners - np.array([100.0, 40.0])) / 2.0)), T0)
     assert isinstance(seen, Sightings), said
     assert seen.sightings[0].range_m == pytest.approx(math.hypot(DOOR.x, DOOR.y), abs=4e-3)
 
@@ -144,7 +144,11 @@ def test_tags_that_give_no_sighting_are_said() -> None:
         (detection(7, 320.0 + 0.01 * corners), BadMessage.BAD_DETECTION, "a side of"),
         (detection(7, corners * 3.0), BadMessage.WRONG_SIZE, "640 x 480"),
         # A tag that hangs far lower than the team file states
-        (detection(7, corners + [0.0, 160.0]), BadMessage.BAD_DETECTION, "0.4 m above the floor"),
+        (
+            detection(7, corners + np.array([0.0, 160.0])),
+            BadMessage.BAD_DETECTION,
+            "0.4 m above the floor",
+        ),
     ):
         seen, said = seen_with(detections(T0, message))
         assert isinstance(seen, Sightings)
