@@ -128,7 +128,7 @@ class TeamBridge:
         now_s = time.monotonic()
         if now_s >= self._findings_s:
             self._findings_s = now_s + FINDINGS_S
-            self._tell(self._found())
+            self.look_for_findings()
         if self._diagnostics is not None and now_s >= self._diagnostics_s:
             self._diagnostics_s = now_s + DIAGNOSTICS_S
             self._diagnostics.put(self._diagnostics_fields(now_s))
@@ -141,11 +141,12 @@ class TeamBridge:
         """What was found at the last look, one line each."""
         return self._findings
 
-    def _found(self) -> list[str]:
+    def look_for_findings(self) -> None:
+        """Looks for what is not heard, and logs what is new."""
         lines = self._node.findings()
         for robot in self.robots:
             lines += robot.findings()
-        return lines + self._unread_tags()
+        self._tell(lines + self._unread_tags())
 
     def _unread_tags(self) -> list[str]:
         """Detections that are published, although no tag has a meaning."""

@@ -69,7 +69,8 @@ class RobotInputs:
         self._names = frozenset(team.map.landmarks) | frozenset(team.map.walls)
         self._names |= frozenset(team.robots) - {name}
         self._publishers: dict[type[SensorInput], Publisher] = {}
-        self._counts: dict[str, int] = {}
+        self.counts: dict[str, int] = {}
+        """Messages by topic."""
         self._arrived_s: dict[str, float] = {}
         self._frame_ns = 0
         self._has_failed: set[str] = set()
@@ -111,7 +112,7 @@ class RobotInputs:
     def on_message(self, row: InputTopic, message: Any) -> None:
         """Takes a message of a topic. Raises nothing: nobody can show it every message."""
         topic = row.topic
-        self._counts[topic] = self._counts.get(topic, 0) + 1
+        self.counts[topic] = self.counts.get(topic, 0) + 1
         self._arrived_s[topic] = time.monotonic()
         try:
             taken = self._taken(row, message)
