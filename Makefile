@@ -7,7 +7,7 @@ BIN = $(VENV)/bin
 # Where it is set, each process that the tests start compiles whatever it imports once more.
 export PYTHONDONTWRITEBYTECODE =
 
-.PHONY: setup demo test quick check unit test-long test-trial test-compiled test-docker test-bench \
+.PHONY: setup demo test quick check unit test-long test-ros2 test-trial test-compiled test-docker test-bench \
   chaos net fuzz compiled bench bench-degraded bench-detection bench-latency bench-pictures \
   bench-processes bench-scaling bench-view screenshot clean
 
@@ -43,11 +43,22 @@ check: setup
 unit: setup
 	$(BIN)/pytest -n 4 --dist worksteal -m "$(USUAL)"
 
-USUAL = not long and not log and not pictures and not docker and not trial
+USUAL = not long and not log and not pictures and not docker and not trial and not ros2
 
 # Minutes long; with CPCBL_MRCLAM=folder also on real logs, with CPCBL_PICTURES=folder real pictures.
 test-long: setup
 	$(BIN)/pytest -n 2 -m "long$(if $(CPCBL_MRCLAM), or log)$(if $(CPCBL_PICTURES), or pictures)"
+
+# Independent implementations of ROS 2, from wheels for Python 3.11, in a venv of their own.
+test-ros2: setup $(PARTNERS)/ready
+	CPCBL_ROS2=$(PARTNERS) $(BIN)/pytest -n 2 -m ros2 tests/ros2
+
+PARTNERS = build/ros2-partners
+PARTNERS_PYTHON ?= python3.11
+$(PARTNERS)/ready: tests/ros2/partners.txt
+	$(PARTNERS_PYTHON) -m venv $(PARTNERS)
+	$(PARTNERS)/bin/python -m pip install --quiet --disable-pip-version-check -r $<
+	@touch $@
 
 # What a new user does, with a browser; needs Chromium (Debian: apt-get install chromium).
 test-trial: setup

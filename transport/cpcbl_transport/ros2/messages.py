@@ -83,6 +83,10 @@ class MessageTypes:
             setattr(message, field, value)
         return message
 
+    def fields(self, name: str) -> list[tuple[str, Any]]:
+        """The fields of a type and their description by rosbags (`rosbags.interfaces.Nodetype`)."""
+        return list(self._store.fielddefs[name][1])
+
     def require(self, name: str) -> str:
         """The full name of a type of this distribution. Raises RosNameError for another one."""
         full = type_name(name)

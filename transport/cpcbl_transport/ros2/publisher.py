@@ -36,6 +36,12 @@ class RosPublisher:
     def type_name(self) -> str:
         return self._endpoint.type_name
 
+    @property
+    def matching(self) -> bool:
+        """Whether somebody subscribes at present: ask before making a large message. A transient
+        local topic always matches, for it keeps its messages for those that come later."""
+        return self._publisher.matching
+
     def publish(self, message: Message, stamp_ns: int | None = None) -> None:
         """Sends a message; `stamp_ns` is what its attachment says (by default: now). Raises
         ValueError for a message of another type: a mistake of the programmer."""

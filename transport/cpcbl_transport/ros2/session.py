@@ -166,6 +166,13 @@ class SamplePublisher(_Declared):
         super().__init__(session, publisher)
         self._publisher, self._open = publisher, True
 
+    @property
+    def matching(self) -> bool:
+        """Whether there is a subscription at present. Of a transient local publisher it is always
+        said, since later ones get its messages too."""
+        status = getattr(self._publisher, "matching_status", None)
+        return self._open and (status is None or bool(status.matching))
+
     def put(self, payload: bytes, attachment: bytes | None) -> None:
         """Publishes; nothing after it was closed."""
         if self._open:

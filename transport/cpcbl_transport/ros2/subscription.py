@@ -71,8 +71,6 @@ class Subscription:
             self._on_message(decoded)
 
     def _decode(self, sample: Sample, received_ns: int) -> Received | PayloadRefusal:
-        if len(sample.payload) > self._largest_bytes:
-            return PayloadRefusal.TOO_LARGE
         stamp_ns, gid, type_hash = None, b"", ""
         if self._endpoint.layout is Layout.RMW_ZENOH:
             attachment = decode_attachment(sample.attachment or b"")
@@ -81,6 +79,8 @@ class Subscription:
             self._count_lost(attachment)
             stamp_ns, gid = attachment.source_stamp_ns, attachment.gid
             type_hash = type_hash_of_key(sample.key)
+        if len(sample.payload) > self._largest_bytes:
+            return PayloadRefusal.TOO_LARGE
         message = self._types.decode(self._endpoint.type_name, sample.payload, type_hash)
         if isinstance(message, PayloadRefusal):
             return message
