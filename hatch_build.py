@@ -22,6 +22,7 @@ HOT = (
     "geometry",
     "landmarks",
     "localizer",
+    "map_rejections",
     "miscalibration",
     "motion",
     "object_timers",

@@ -29,22 +29,19 @@ def sensitivity_after(v: Matrix3, distance: float, turn: float, course: float) -
     frame) and turns by `turn` (rad)."""
     lx, ly = -distance * math.sin(course), distance * math.cos(course)
     xd, xt, xb, yd, yt, yb, hd, ht, hb = v
-    return (
-        *(xd + lx * hd + ly, xt + lx * (ht + 0.5 * turn), xb + lx * (hb + 1.0)),
-        *(yd + ly * hd - lx, yt + ly * (ht + 0.5 * turn), yb + ly * (hb + 1.0)),
-        *(hd, ht + turn, hb),
-    )
+    xd, xt, xb = xd + lx * hd + ly, xt + lx * (ht + 0.5 * turn), xb + lx * (hb + 1.0)
+    yd, yt, yb = yd + ly * hd - lx, yt + ly * (ht + 0.5 * turn), yb + ly * (hb + 1.0)
+    return xd, xt, xb, yd, yt, yb, hd, ht + turn, hb
 
 
 def matrix_product(m: Matrix3, n: Matrix3) -> Matrix3:
     """M N."""
     a, b, c, d, e, f, g, h, i = m
     xx, xy, xz, yx, yy, yz, zx, zy, zz = n
-    return (
-        *(a * xx + b * yx + c * zx, a * xy + b * yy + c * zy, a * xz + b * yz + c * zz),
-        *(d * xx + e * yx + f * zx, d * xy + e * yy + f * zy, d * xz + e * yz + f * zz),
-        *(g * xx + h * yx + i * zx, g * xy + h * yy + i * zy, g * xz + h * yz + i * zz),
-    )
+    a, b, c = a * xx + b * yx + c * zx, a * xy + b * yy + c * zy, a * xz + b * yz + c * zz
+    d, e, f = d * xx + e * yx + f * zx, d * xy + e * yy + f * zy, d * xz + e * yz + f * zz
+    g, h, i = g * xx + h * yx + i * zx, g * xy + h * yy + i * zy, g * xz + h * yz + i * zz
+    return a, b, c, d, e, f, g, h, i
 
 
 def difference(m: Matrix3, n: Matrix3) -> Matrix3:
@@ -56,7 +53,8 @@ def difference(m: Matrix3, n: Matrix3) -> Matrix3:
 
 def matrix_of(c: Covariance3) -> Matrix3:
     """The covariance with its symmetric entries written twice."""
-    return c.xx, c.xy, c.xh, c.xy, c.yy, c.yh, c.xh, c.yh, c.hh
+    xx, xy, yy, xh, yh, hh = c
+    return xx, xy, xh, xy, yy, yh, xh, yh, hh
 
 
 def pose_offset(sensitivity: Matrix3, errors: Row) -> Row:

@@ -34,7 +34,7 @@ from cpcbl_team.estimate import (
 )
 from cpcbl_team.fusion import chi_square
 from cpcbl_team.gaussian import width_per_m
-from cpcbl_team.geometry import wrap_angle
+from cpcbl_team.geometry import new, wrap_angle
 from cpcbl_team.inputs import Sighting
 from cpcbl_team.miscalibration import AS_CONFIGURED, Adaptation
 from cpcbl_team.sensors import (
@@ -46,6 +46,7 @@ from cpcbl_team.sensors import (
 from cpcbl_team.state import Evidence, LandmarkSnapshot, State
 
 _astuple: Final = msgspec.structs.astuple  # see `constraints._atan2`
+_hypot: Final = math.hypot
 Numbers = tuple[str, float | None, float | None, object, object, object, object]
 """Of a sighting, in its order; of a plain one the last four are None."""
 
@@ -226,30 +227,36 @@ class Landmarks:
     ) -> list[Evidence]:
         """The evidence of a snapshot, one piece a landmark, as the robot would measure it with this
         adaptation of its settings."""
-        stamp_ns, odometry_from_robot, pose, sightings = snapshot
-        ranges, bias, k = (
-            adaptation.ranges,
-            adaptation.bearing_bias_rad,
-            sqrt(adaptation.sensor_factor),
-        )
+        stamp_ns, place, pose, sightings = snapshot
+        _, _, bias, _, factor, ranges = adaptation
+        scale, offset_m, k = ranges.scale, ranges.offset_m, sqrt(factor)
+        bearing_sigma = k * self._bearing_sigma_rad
+        pose_x, pose_y, _ = pose
         first: dict[str, Sighting] = {}
         for sighting in sightings:
             first.setdefault(sighting.id, sighting)
         pieces = []
         for name, sighting in first.items():
-            mark, range_m, sigma_m = self._marks[name], sighting.range_m, 0.0
+            mark, sigma_m = self._marks[name], 0.0
+            numbers: Numbers = _astuple(sighting)
+            range_m, bearing = numbers[1], numbers[2]
             if not mark.gives_range or range_m is None or range_m > self._farthest_m:
                 range_m = None
             else:
-                distance = math.hypot(mark.x - pose.x, mark.y - pose.y)
+                distance = _hypot(mark.x - pose_x, mark.y - pose_y)
                 sigma_m = k * sqrt(self._range_variance(distance, range_m))
-                range_m = ranges.scale * range_m + ranges.offset_m
-            bearing = sighting.bearing_rad if mark.gives_bearing else None
-            if bearing is not None and bias != 0.0:
+                range_m = scale * range_m + offset_m
+            if not mark.gives_bearing:
+                bearing = None
+            elif bearing is not None and bias != 0.0:
                 bearing = wrap_angle(bearing - bias)
-            where = stamp_ns, odometry_from_robot, name, mark.x, mark.y
-            sigmas = sigma_m, k * self._bearing_sigma_rad
-            pieces.append(Evidence(*where, range_m, bearing, *sigmas))
+            x, y = mark.x, mark.y
+            # The last four are of teammates. (With a star a compiled tuple is made of a list.)
+            piece = (
+                stamp_ns, place, name, x, y, range_m, bearing, sigma_m, bearing_sigma,
+                0.0, False, None, 0.0,
+            )  # fmt: skip
+            pieces.append(new(Evidence, piece))
         return pieces
 
 

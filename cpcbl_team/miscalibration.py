@@ -7,7 +7,8 @@ are summed over blocks of 1.5 s.
 
 - Corrections that a constant error explains (`constant_errors.py`): odometry measures with a wrong
   scale, or bearings have a bias. What no wrong calibration explains is not corrected.
-- One object of the map is rejected time after time, and hardly any other: it stands elsewhere.
+- One object of the map is rejected time after time, and hardly any other: it stands elsewhere
+  (`map_rejections.py`).
 - Larger corrections than are due: the motion is less certain than the settings say if each
   correction resembles the one before, and the sensor is if it does not.
 
@@ -15,7 +16,7 @@ Only what the robot measures itself counts: a teammate's reports cannot change h
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Final, NamedTuple
 
 from cpcbl_team.config import OdometryNoise
@@ -31,8 +32,15 @@ from cpcbl_team.constant_errors import (
     sensitivity_after,
     whiten,
 )
-from cpcbl_team.estimate import SMALLEST_VARIANCE, Covariance3, Estimate, Matrix3, Row
-from cpcbl_team.geometry import Pose2, wrap_angle
+from cpcbl_team.estimate import (
+    SMALLEST_VARIANCE,
+    ZERO3,
+    Covariance3,
+    Estimate,
+    Matrix3,
+    Row,
+)
+from cpcbl_team.geometry import Pose2, new, wrap_angle
 from cpcbl_team.motion import move
 from cpcbl_team.range_errors import NO_RANGE_ERRORS, RangeErrors
 
@@ -64,13 +72,7 @@ LEAST_REJECTED: Final = 0.01  # share of objects of the map
 LEAST_REJECTIONS: Final = 3
 MOST_DUE: Final = 5.0  # times the share that the gate rejects of correct measurements
 MOST_FACTOR: Final = 400.0  # of a variance
-FADING_S: Final = 120.0  # of rejections of objects of the map
-LEAST_MISPLACED: Final = 6.0  # rejections of an object that stands elsewhere,
-MISPLACED_SHARE: Final = 0.7  # of all, and
-MISPLACED_REJECTED: Final = 0.003  # of what is accepted, of any object
-MISPLACED: Final = "misplaced_"  # the count of such an object begins with this
 UNITS: Final = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
-_NONE: Final[Mapping[str, float]] = {}
 
 
 class Corrected(NamedTuple):
@@ -102,62 +104,46 @@ class ModelCheck(NamedTuple):
 
     def from_pose(self, now: Corrected) -> "ModelCheck":
         """With a block that begins now, after one that tells nothing."""
-        return self._replace(begin=now, ahead=now, sensitivity=INSENSITIVE)
+        return self.with_block(now, now, INSENSITIVE, self.evidence)
 
     def with_step(self, stamp_ns: int, place_now: Pose2, noise: OdometryNoise) -> "ModelCheck":
         """With the odometry until now, as one arc. A block has several: how a turn's noise moves
         the position depends on the path."""
-        ahead = self.ahead or self.begin
+        begin, sensitivity, evidence, _, _, _, _, ahead = self
+        ahead = ahead or begin
         assert ahead is not None
-        _, (pose, covariance, _), place, gaps = ahead
-        x, y = place_now.x - place.x, place_now.y - place.y
-        distance, turn = math.sqrt(x * x + y * y), wrap_angle(place_now.heading - place.heading)
-        course = math.atan2(y, x) - place.heading + pose.heading
-        start = Estimate(Pose2(pose.x, pose.y, course - 0.5 * turn), covariance)
-        moved, due, _ = move(start, distance, turn, noise)
-        estimate = Estimate(Pose2(moved.x, moved.y, wrap_angle(pose.heading + turn)), due)
-        return self._replace(
-            ahead=Corrected(stamp_ns, estimate, place_now, gaps),
-            sensitivity=sensitivity_after(self.sensitivity, distance, turn, course),
-        )
+        _, estimate, place, gaps = ahead  # unpacked one by one: that is fast when compiled
+        pose, covariance, _ = estimate
+        pose_x, pose_y, pose_h = pose
+        place_x, place_y, place_h = place
+        now_x, now_y, now_h = place_now
+        x, y = now_x - place_x, now_y - place_y
+        distance, turn = math.sqrt(x * x + y * y), wrap_angle(now_h - place_h)
+        course = math.atan2(y, x) - place_h + pose_h
+        start = new(Pose2, (pose_x, pose_y, course - 0.5 * turn))
+        moved, due, _ = move(new(Estimate, (start, covariance, ZERO3)), distance, turn, noise)
+        pose = new(Pose2, (moved[0], moved[1], wrap_angle(pose_h + turn)))
+        here = new(Corrected, (stamp_ns, new(Estimate, (pose, due, ZERO3)), place_now, gaps))
+        sensitivity = sensitivity_after(sensitivity, distance, turn, course)
+        return self.with_block(begin, here, sensitivity, evidence)
+
+    def with_block(
+        self,
+        begin: Corrected | None,
+        ahead: Corrected | None,
+        sensitivity: Matrix3,
+        evidence: Evidence,
+    ) -> "ModelCheck":
+        """With another block. (`_replace` would take as long as the rest of a step.)"""
+        _, _, _, number, last, accepted, doubts, _ = self
+        check = begin, sensitivity, evidence, number, last, accepted, doubts, ahead
+        return new(ModelCheck, check)
 
     def with_rejections(self, names: Sequence[str]) -> "ModelCheck":
         """With more rejected objects of the map. One that is rejected time after time, while
         others are accepted, stands elsewhere than on the map: this tells nothing of the robot."""
         others = sum(name != self.rejected for name in names)
         return self._replace(rejections=self.rejections + others, rejected=names[-1])
-
-
-class MapRejections(NamedTuple):
-    """How often each object of the map was rejected of late, and how often objects were accepted:
-    sums that fade."""
-
-    of_object: Mapping[str, float] = _NONE
-    accepted: float = 0.0
-    counted: int = 0  # accepted observations since the start, until
-    stamp_ns: int = 0
-
-    def plus(self, names: Sequence[str], stamp_ns: int, accepted: int) -> "MapRejections":
-        """With these rejections now; so many observations have been `accepted` since the start."""
-        passed = max((stamp_ns - self.stamp_ns) * 1e-9, 1e-3)
-        k = math.exp(-passed / FADING_S)
-        of_object = {name: k * count for name, count in self.of_object.items()}
-        for name in names:
-            of_object[name] = of_object.get(name, 0.0) + 1.0
-        rate = (accepted - self.counted) / passed
-        total = k * self.accepted + (1.0 - k) * FADING_S * rate
-        return MapRejections(of_object, total, accepted, stamp_ns)
-
-    def misplaced(self, stamp_ns: int) -> str:
-        """The object that must stand elsewhere than on the map, for it alone is rejected time after
-        time while others are accepted; empty if there is none."""
-        if not self.of_object:
-            return ""
-        name, most = max(self.of_object.items(), key=lambda item: item[1])
-        now = most * math.exp(-(stamp_ns - self.stamp_ns) * 1e-9 / FADING_S)
-        total = sum(self.of_object.values())
-        is_clear = most > MISPLACED_SHARE * total and most > MISPLACED_REJECTED * self.accepted
-        return name if is_clear and now > LEAST_MISPLACED else ""
 
 
 class Adaptation(NamedTuple):
@@ -191,7 +177,7 @@ def check_models(check: ModelCheck, now: Corrected, noise: OdometryNoise) -> Mod
     if abs(turn) > MOST_TURN_RAD:
         return check.from_pose(now)
     if x * x + y * y < LEAST_DISTANCE_M**2 and abs(turn) < LEAST_TURN_RAD:
-        return check._replace(begin=now, ahead=now)
+        return check.with_block(now, now, check.sensitivity, check.evidence)
     check = check.with_step(now.stamp_ns, place_now, noise)
     assert check.ahead is not None
     (predicted, due, _), sensitivity = check.ahead.estimate, check.sensitivity
@@ -211,12 +197,8 @@ def check_models(check: ModelCheck, now: Corrected, noise: OdometryNoise) -> Mod
         taken.transformed(to_course),
         added.transformed(to_course),
     )
-    return check._replace(
-        begin=now,
-        ahead=now,
-        sensitivity=difference(sensitivity, corrected),
-        evidence=check.evidence.plus(whitened),
-    )
+    evidence = check.evidence.plus(whitened)
+    return check.with_block(now, now, difference(sensitivity, corrected), evidence)
 
 
 class Rules(NamedTuple):

@@ -153,14 +153,13 @@ class OwnCalibration:
                 read_m = (e.range_m - present.offset_m) / present.scale  # these are corrected
                 pieces.append(e._replace(range_m=read_m))
         for snapshot in recovery.snapshots:
-            if snapshot.stamp_ns > since_ns:
+            if snapshot[0] > since_ns:
                 pieces += self._landmarks.evidence_of(snapshot)
         frames: dict[int, list[Seen]] = {}
-        for e in pieces:
-            if e.range_m is not None and e.bearing_rad is not None:
-                sigmas = e.range_sigma_m, e.bearing_sigma_rad
-                seen = Seen(e.source, e.x, e.y, e.range_m, e.bearing_rad, *sigmas)
-                frames.setdefault(e.stamp_ns, []).append(seen)
+        for stamp_ns, _, name, x, y, range_m, bearing, sigma_m, sigma_rad, _, _, _, _ in pieces:
+            if range_m is not None and bearing is not None:
+                seen = new(Seen, (name, x, y, range_m, bearing, sigma_m, sigma_rad))
+                frames.setdefault(stamp_ns, []).append(seen)
         return frames.values()
 
     def _after_learning(self, state: State) -> State:
@@ -178,14 +177,15 @@ class OwnCalibration:
     def _after_check(self, state: State) -> State:
         """The state at the end of a block."""
         gaps = state.memory.events.get("odometry_gap", 0)
-        now = Corrected(state.stamp_ns, state.estimate, state.odometry_from_robot, gaps)
-        memory = state.memory.calibration
-        check, present, begin = memory.check, memory.adaptation, memory.check.begin
+        now_ns, estimate, place, _, odometry_until_ns, _, memory = state
+        now = new(Corrected, (now_ns, estimate, place, gaps))
+        known = memory.calibration
+        check, present, begin = known.check, known.adaptation, known.check.begin
         if (
             begin is None
-            or state.memory.recovery.lost
-            or state.odometry_until_ns < state.stamp_ns
-            or state.memory.teammates.last_report_ns >= begin.stamp_ns
+            or memory.recovery.lost
+            or odometry_until_ns < now_ns
+            or memory.teammates.last_report_ns >= begin.stamp_ns
         ):
             check = check.from_pose(now)
         else:

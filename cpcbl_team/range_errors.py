@@ -13,8 +13,12 @@ linear enough to be used: chosen by their own noise, distances would be too shor
 
 import math
 from collections.abc import Mapping, Sequence
-from itertools import combinations
+from math import cos, sin
 from typing import Final, NamedTuple
+
+from cpcbl_team.geometry import new
+
+_hypot: Final = math.hypot  # see `constraints._atan2`
 
 FADING: Final = 1.0 - 1.0 / 500.0  # of all sums, a frame
 PRIOR_SHARE: Final = 0.05  # sigmas; the two errors look alike, and each takes its part. Wider ones
@@ -71,7 +75,15 @@ class Fit(NamedTuple):
     b: float = 0.0
 
     def plus(self, other: "Fit", factor: float = 1.0) -> "Fit":
-        return Fit(*(mine + factor * its for mine, its in zip(self, other, strict=True)))
+        ss, sb, bb, s, b = other
+        parts = (
+            self.ss + factor * ss,
+            self.sb + factor * sb,
+            self.bb + factor * bb,
+            self.s + factor * s,
+            self.b + factor * b,
+        )
+        return new(Fit, parts)
 
     def explained(self, errors: RangeErrors) -> float:
         """By how much these errors reduce the sum of squares."""
@@ -94,10 +106,37 @@ class PairGeometry(NamedTuple):
     across: float  # the variance (m^2) of both landmarks across the line between them
 
     def plus(self, last: "PairGeometry") -> "PairGeometry":
-        pairs = zip(self, last, strict=True)
-        return PairGeometry(*(mean + LAST_SHARE * (new - mean) for mean, new in pairs))
+        per_bias, across = self
+        last_bias, last_across = last
+        per_bias += LAST_SHARE * (last_bias - per_bias)
+        across += LAST_SHARE * (last_across - across)
+        return new(PairGeometry, (per_bias, across))
 
 
+class FadedFit:
+    """Adds up a fit, of which what was known before the present frame fades."""
+
+    def __init__(self, before: Fit) -> None:
+        ss, sb, bb, s, b = before
+        self.ss, self.sb, self.bb = FADING * ss, FADING * sb, FADING * bb
+        self.s, self.b = FADING * s, FADING * b
+
+    def add(self, weight: float, s: float, b: float, error: float) -> None:
+        """Adds a distance that is read too short by `error`, of which a share of one makes `s` and
+        a bias of one metre `b`; `weight` is the inverse of its variance."""
+        ws, wb = weight * s, weight * b
+        self.ss += ws * s
+        self.sb += ws * b
+        self.bb += wb * b
+        self.s += ws * error
+        self.b += wb * error
+
+    def fit(self) -> Fit:
+        return new(Fit, (self.ss, self.sb, self.bb, self.s, self.b))
+
+
+NO_FIT: Final = Fit()
+NOTHING: Final = (0.0, 0.0, 0.0, 0.0, 0.0)
 _NONE: Final[Mapping[str, Fit]] = {}
 _NO_PAIRS: Final[Mapping[tuple[str, str], PairGeometry]] = {}
 
@@ -118,30 +157,35 @@ class RangeEvidence(NamedTuple):
         if len(frame) < 2:
             return self
         weight = 1.0 / (len(frame) - 1)  # each landmark is in so many pairs
-        nothing = Fit()
-        of_object = {name: nothing.plus(fit, FADING) for name, fit in self.of_object.items()}
-        fit, squares, pairs = (
-            nothing.plus(self.fit, FADING),
-            FADING * self.squares,
-            FADING * self.pairs,
-        )
-        geometry = {}
-        for one, other in combinations(sorted(frame), 2):
-            found = _distance_error(one, other)
-            if found is None:
-                continue
-            error, s, variance, last = found
-            pair = one.name, other.name
-            before = self.geometry.get(pair)
-            geometry[pair] = last if before is None else before.plus(last)
-            if before is None or before.across > CURVED * s * s:
-                continue
-            w, b = weight / variance, before.per_bias
-            of_pair = Fit(w * s * s, w * s * b, w * b * b, w * s * error, w * b * error)
-            fit, squares, pairs = fit.plus(of_pair), squares + w * error**2, pairs + weight
-            for name in (one.name, other.name):
-                of_object[name] = of_object.get(name, nothing).plus(of_pair)
-        return RangeEvidence(fit, squares, pairs, of_object, geometry)
+        fit, squares, pairs, earlier, geometry_before = self
+        total, squares, pairs = FadedFit(fit), FADING * squares, FADING * pairs
+        of_object = {name: FadedFit(fit) for name, fit in earlier.items()}
+        geometry: dict[tuple[str, str], PairGeometry] = {}
+        landmarks = [SeenLandmark(seen) for seen in sorted(frame)]
+        for i, one in enumerate(landmarks):
+            for other in landmarks[i + 1 :]:
+                error, s, variance, b, across = _distance_error(one, other)
+                if variance == 0.0:
+                    continue
+                pair, last = (one.name, other.name), new(PairGeometry, (b, across))
+                before = geometry_before.get(pair)
+                if before is None:
+                    geometry[pair] = last
+                    continue
+                geometry[pair] = before.plus(last)
+                b, across = before
+                if across > CURVED * s * s:
+                    continue
+                w = weight / variance
+                squares, pairs = squares + w * error**2, pairs + weight
+                total.add(w, s, b, error)
+                for name in pair:
+                    of_one = of_object.get(name)
+                    if of_one is None:
+                        of_one = of_object[name] = FadedFit(NO_FIT)
+                    of_one.add(w, s, b, error)
+        fits = {name: one_fit.fit() for name, one_fit in of_object.items()}
+        return new(RangeEvidence, (total.fit(), squares, pairs, fits, geometry))
 
     def errors(self, present: RangeErrors, independent_share: float) -> RangeErrors:
         """The errors of ranges: none until some are clear, then the best estimate. This share of
@@ -172,32 +216,36 @@ class RangeEvidence(NamedTuple):
         return max(abs(share + bias_m / (k * usual_m)) for k in (0.5, 1.5))
 
 
-def _distance_error(one: Seen, other: Seen) -> tuple[float, float, float, PairGeometry] | None:
+class SeenLandmark:
+    """A landmark in the robot's frame, and the variances (m^2) of where it was seen."""
+
+    def __init__(self, seen: Seen) -> None:
+        name, map_x, map_y, range_m, bearing, range_sigma_m, bearing_sigma = seen
+        self.name, self.map_x, self.map_y, self.range_m = name, map_x, map_y, range_m
+        self.x, self.y = range_m * cos(bearing), range_m * sin(bearing)
+        self.of_range, self.of_bearing = range_sigma_m**2, (range_m * bearing_sigma) ** 2
+
+
+def _distance_error(
+    one: SeenLandmark, other: SeenLandmark
+) -> tuple[float, float, float, float, float]:
     """By how much the distance between two landmarks is read too short (m), what a share of one
-    makes of it, its variance (m^2), and how the pair was seen; None if nothing can be said."""
-    distance = math.hypot(other.x - one.x, other.y - one.y)
-    ax, ay = _point(one)
-    bx, by = _point(other)
-    read = math.hypot(bx - ax, by - ay)
+    makes of it, its variance (m^2; 0: nothing can be said), and how the pair was seen."""
+    distance = _hypot(other.map_x - one.map_x, other.map_y - one.map_y)
+    dx, dy = other.x - one.x, other.y - one.y
+    read = _hypot(dx, dy)
     if read == 0.0:
-        return None
-    along_x, along_y = (bx - ax) / read, (by - ay) / read
-    variance = across = per_bias = 0.0
-    for seen, x, y, sign in ((one, ax, ay, -1.0), (other, bx, by, 1.0)):
-        towards = (x * along_x + y * along_y) / seen.range_m
-        of_range = seen.range_sigma_m**2
-        of_bearing = (seen.range_m * seen.bearing_sigma_rad) ** 2
-        c, s = towards * towards, 1.0 - towards * towards
-        variance += c * of_range + s * of_bearing
-        across += s * of_range + c * of_bearing
-        per_bias += sign * towards
-    if distance == 0.0 or variance == 0.0:
-        return None
+        return NOTHING
+    along_x, along_y = dx / read, dy / read
+    of_one = (one.x * along_x + one.y * along_y) / one.range_m
+    of_other = (other.x * along_x + other.y * along_y) / other.range_m
+    c, c_other = of_one * of_one, of_other * of_other
+    s, s_other = 1.0 - c, 1.0 - c_other
+    variance = c * one.of_range + s * one.of_bearing
+    variance += c_other * other.of_range + s_other * other.of_bearing
+    across = s * one.of_range + c * one.of_bearing
+    across += s_other * other.of_range + c_other * other.of_bearing
+    if distance == 0.0:
+        return NOTHING
     error = distance - (read - 0.5 * across / distance)
-    return error, distance, variance, PairGeometry(per_bias, across)
-
-
-def _point(seen: Seen) -> tuple[float, float]:
-    """Where a landmark was seen, in the robot's frame."""
-    r, a = seen.range_m, seen.bearing_rad
-    return r * math.cos(a), r * math.sin(a)
+    return error, distance, variance, of_other - of_one, across

@@ -12,10 +12,10 @@ from typing import Final, NamedTuple
 from cpcbl_team.config import Field, LocalizationSettings, LocalizerSettings
 from cpcbl_team.estimate import Covariance3, Estimate
 from cpcbl_team.landmarks import Landmarks
+from cpcbl_team.map_rejections import MapRejections
 from cpcbl_team.miscalibration import (
     AS_CONFIGURED,
     Adaptation,
-    MapRejections,
     noise_with_factor,
 )
 from cpcbl_team.recovery_evidence import WINDOW_NS, latest

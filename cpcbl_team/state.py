@@ -16,10 +16,10 @@ from cpcbl_team.config import Field, Start
 from cpcbl_team.estimate import HEADING, POSE, POSITION, Covariance3, Estimate, Scope
 from cpcbl_team.geometry import Pose2, new, wrap_angle
 from cpcbl_team.inputs import Belief, Odometry, Sighting
+from cpcbl_team.map_rejections import MapRejections
 from cpcbl_team.miscalibration import (
     AS_CONFIGURED,
     Adaptation,
-    MapRejections,
     ModelCheck,
     with_doubts,
 )

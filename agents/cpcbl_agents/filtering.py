@@ -16,7 +16,8 @@ from cpcbl_team.inputs import (
     Sightings,
 )
 from cpcbl_team.localizer import Localizer
-from cpcbl_team.miscalibration import MISPLACED, percentages
+from cpcbl_team.map_rejections import MISPLACED
+from cpcbl_team.miscalibration import percentages
 from cpcbl_team.self_calibration import SelfCalibration
 from cpcbl_team.sensors import recalibrated
 from cpcbl_team.timeline import Timeline

@@ -38,11 +38,11 @@ from cpcbl_team.estimate import Covariance3
 from cpcbl_team.geometry import Pose2, step, wrap_angle
 from cpcbl_team.inputs import Odometry, Sightings
 from cpcbl_team.localizer import Localizer
+from cpcbl_team.map_rejections import MapRejections
 from cpcbl_team.miscalibration import (
     AS_CONFIGURED,
     Adaptation,
     Corrected,
-    MapRejections,
     ModelCheck,
     Rules,
     adapted,

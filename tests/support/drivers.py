@@ -115,7 +115,8 @@ class DrivenRobot:
         while self._waiting and self._waiting[0][0] <= self.now_ns:
             _, _, kind, payload = self._waiting.pop(0)
             self._publishers[kind].put(payload)
-        self.node.step(self.now_ns)
+        if self.node.waiting or self.node.next_ns <= self.now_ns:  # as the loop of a process does
+            self.node.step(self.now_ns)
 
     def _stamp(self, stamp_ns: int) -> int:
         return stamp_ns + round((stamp_ns - EPOCH) * self.world.drift)

@@ -6,7 +6,10 @@ end, so that an older reader skips what it does not know. Fixes and beliefs have
 """
 
 import math
+from collections.abc import Iterable
 from enum import StrEnum
+from itertools import repeat
+from typing import Final
 
 import msgspec
 
@@ -300,11 +303,8 @@ def refusal(message: Message, now_ns: int) -> Refusal | None:
         return Refusal.IMPLAUSIBLE if finite else Refusal.NOT_FINITE
     if abs(message.stamp_ns) >= LAST_NS:
         return Refusal.IMPLAUSIBLE
-    if isinstance(message, Telemetry):
-        for name, n in _leaves(message):
-            is_stamp = name.endswith("_ns")
-            if isinstance(n, int) and abs(n) > (LAST_NS - 1 if is_stamp else LARGEST_COUNT):
-                return Refusal.IMPLAUSIBLE
+    if isinstance(message, Telemetry) and _has_large_integer(message):
+        return Refusal.IMPLAUSIBLE
     if message.stamp_ns > now_ns + FUTURE_NS:
         return Refusal.FUTURE
     if isinstance(message, Odometry):
@@ -320,34 +320,44 @@ def refusal(message: Message, now_ns: int) -> Refusal | None:
 
 
 def _numbers(message: msgspec.Struct) -> list[float]:
-    """All numbers in a message that are no integers, however deep. It runs for every
-    message, so it does without the names that `_leaves` gives."""
+    """All numbers in a message that are no integers, however deep."""
     found: list[float] = []
     parts: list[object] = [message]
     for part in parts:  # the list grows meanwhile
-        if isinstance(part, float):
-            found.append(part)
-        elif isinstance(part, tuple):
-            parts.extend(part)
-        elif isinstance(part, msgspec.Struct):
-            parts.extend(msgspec.structs.astuple(part))
-        elif isinstance(part, dict):
-            parts.extend(part.values())
+        for value in _items(part)[1]:
+            if isinstance(value, float):
+                found.append(value)
+            elif type(value) not in _WITHOUT_PARTS:
+                parts.append(value)
     return found
 
 
-def _leaves(message: msgspec.Struct) -> list[tuple[str, object]]:
-    """All numbers and texts in a message, however deep, with the names of their fields."""
-    found: list[tuple[str, object]] = []
-    parts: list[tuple[str, object]] = [("", message)]
-    for name, part in parts:  # the list grows meanwhile
-        if isinstance(part, tuple):
-            parts.extend((name, item) for item in part)
-        elif isinstance(part, dict):
-            parts.extend(part.items())
-        elif isinstance(part, msgspec.Struct):
-            values = msgspec.structs.astuple(part)
-            parts.extend(zip(part.__struct_fields__, values, strict=True))
-        else:
-            found.append((name, part))
-    return found
+def _has_large_integer(message: msgspec.Struct) -> bool:
+    """Whether a count, however deep, or a time is larger than any can be. The name of a time ends
+    with `_ns`."""
+    parts: list[object] = [message]
+    for part in parts:  # the list grows meanwhile
+        names, values = _items(part)
+        for name, value in zip(names, values, strict=False):
+            if type(value) is int:
+                if abs(value) > LARGEST_COUNT and not (
+                    name.endswith("_ns") and abs(value) < LAST_NS
+                ):
+                    return True
+            elif type(value) not in _WITHOUT_NUMBERS:
+                parts.append(value)
+    return False
+
+
+_WITHOUT_PARTS: Final = frozenset({int, bool, str, bytes, type(None)})
+_WITHOUT_NUMBERS: Final = _WITHOUT_PARTS | {float}
+_UNNAMED: Final = repeat("")
+
+
+def _items(part: object) -> tuple[Iterable[str], Iterable[object]]:
+    """The names and the values of the parts of a struct, a mapping or a tuple."""
+    if isinstance(part, msgspec.Struct):
+        return part.__struct_fields__, msgspec.structs.astuple(part)
+    if isinstance(part, dict):
+        return part.keys(), part.values()
+    return _UNNAMED, part if isinstance(part, tuple) else ()

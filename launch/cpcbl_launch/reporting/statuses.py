@@ -7,7 +7,7 @@ from itertools import chain
 import msgspec
 
 from cpcbl_agents.input_diagnosis.problems import without_numbers
-from cpcbl_team.miscalibration import MISPLACED
+from cpcbl_team.map_rejections import MISPLACED
 from cpcbl_transport.messages import Flow, Spending, Status, Trust
 
 
