@@ -8,6 +8,7 @@ from cpcbl_team.config.camera import CameraSettings, Side, VisionSettings
 from cpcbl_team.config.collaboration import CollaborationSettings
 from cpcbl_team.config.field import Bands, Field, SimulationSettings
 from cpcbl_team.config.localizer import LocalizerSettings
+from cpcbl_team.config.ros2 import Ros2RobotSettings, Ros2Settings
 from cpcbl_team.config.sensors import OdometrySettings, PositionSensor, SensorSettings
 from cpcbl_team.config.table import NotNegative, Positive, Table
 from cpcbl_team.inputs import Name
@@ -123,6 +124,8 @@ class RobotSettings(LocalizationSettings, frozen=True, kw_only=True):
     speed_m_s: NotNegative = 0.5
     pose_rate_hz: Annotated[float, msgspec.Meta(gt=0.0, le=100.0)] = 10.0
     """How often the robot publishes its pose (`pose/<robot>`) while somebody subscribes to it."""
+    ros2: Ros2RobotSettings = Ros2RobotSettings()
+    """Its topics and frames in ROS 2, for a team with the table `ros2`."""
 
 
 class MatchSettings(Table, frozen=True, kw_only=True):
@@ -152,6 +155,8 @@ class Team(Table, frozen=True, kw_only=True):
     transport: TransportSettings = TransportSettings()
     gateway: GatewaySettings | None = None
     """With this table `up` also starts the gateway."""
+    ros2: Ros2Settings | None = None
+    """With this table `up` and `robot` also start the bridge to ROS 2."""
     match: MatchSettings = MatchSettings()
     simulation: SimulationSettings = SimulationSettings()
     guests: GuestSettings = GuestSettings()

@@ -25,6 +25,7 @@ COMMANDS = {
     "observer": "watching.observer",
     "router": "running.router",
     "gateway": "running.gateway",
+    "bridge": "bridging.bridge_app",
     "field": "running.field",
     "compose": "preparing.compose",
     "simulate": "measuring.simulate",

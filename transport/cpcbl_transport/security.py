@@ -241,4 +241,6 @@ def _is_in_team(identity: Identity, team: Team) -> bool:
             return team.simulated
         case Role.GATEWAY:
             return team.gateway is not None
+        case Role.BRIDGE:
+            return team.ros2 is not None
     return True

@@ -51,6 +51,7 @@ class Role(StrEnum):
     FIELD = "field"  # the simulated one
     OPERATOR = "operator"  # people: live tables, recordings
     GATEWAY = "gateway"  # speaks for drivers and consumers that have no Zenoh
+    BRIDGE = "bridge"  # speaks for robots that run ROS 2
     ROUTER = "router"  # relays the messages of all others
 
 
@@ -67,7 +68,8 @@ _OWNER = Permission(Role.ROBOT, "robot"), Permission(Role.OBSERVER, "robot")
 _OBSERVER = Permission(Role.ROBOT, "observer"), Permission(Role.OBSERVER, "observer")
 _GUEST = (Permission(Role.OBSERVER, "robot"),)
 _FIELD = (Permission(Role.FIELD),)
-_GATEWAY = (Permission(Role.GATEWAY),)
+_BRIDGE = (Permission(Role.BRIDGE),)
+_GATEWAY = (Permission(Role.GATEWAY), *_BRIDGE)
 _READERS = (*_MEMBERS, *_GATEWAY)
 _SENSING = (*_OWNER, *_FIELD, *_GATEWAY)  # the robot's own driver, or the simulated field
 
@@ -139,7 +141,13 @@ BELIEF = Topic("belief/<tier>/<robot>", Belief, Qos.FRESH, subscribers=_MEMBERS)
 # Each sighting of a worse robot that subscribes. The next one is better than a late one
 FIX = Topic("fix/<robot>/<tier>/<observer>", Fix, Qos.FRESH, publishers=_OBSERVER)
 # 1 Hz. For people; it must never delay a fix
-STATUS = Topic("status/<robot>", messages.Status, Qos.TELEMETRY, also_json=True)
+STATUS = Topic(
+    "status/<robot>",
+    messages.Status,
+    Qos.TELEMETRY,
+    subscribers=(*_OWNER, *_BRIDGE),
+    also_json=True,
+)
 # 10 Hz while somebody records. For reports; it costs nothing without a subscriber
 TRACK = Topic("track/<robot>", messages.Track, Qos.TELEMETRY)
 # `pose_rate_hz` (10 Hz) while somebody subscribes. For the robot's own software, and for everybody

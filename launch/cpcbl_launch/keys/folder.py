@@ -137,6 +137,7 @@ def plan_actions(
     wanted = [Identity(role) for role in (Role.ROUTER, Role.OPERATOR)]
     wanted += [Identity(Role.FIELD)] if team.simulated else []
     wanted += [Identity(Role.GATEWAY)] if team.gateway else []
+    wanted += [Identity(Role.BRIDGE)] if team.ros2 else []
     wanted += [Identity(Role.ROBOT, name) for name in team.robots]
     wanted += [Identity(Role.OBSERVER, name) for name in request.observers]
     everyone = list(dict.fromkeys([*wanted, *before]))

@@ -9,7 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Collection, Sequence
-from contextlib import suppress
+from contextlib import AbstractContextManager, nullcontext, suppress
 from pathlib import Path
 from typing import BinaryIO, NamedTuple, Protocol
 
@@ -77,7 +77,26 @@ def process_table(
     if team.gateway is not None:
         gateway = ("gateway", str(team_file), "--connect", endpoint, "--parent", str(os.getpid()))
         table.append(ProcessSpec("gateway", (*PROGRAM, *gateway)))
+    if team.ros2 is not None:
+        table.append(bridge_spec(str(team_file), [endpoint], str(clock), here))
     return table
+
+
+def bridge_spec(
+    team_file: str, connect: Sequence[str], clock: str, robots: Collection[str]
+) -> ProcessSpec:
+    """The bridge of these robots to ROS 2 as a process of this one. `clock`: robot time, empty for
+    that of the machine."""
+    words = ["bridge", "ros2", team_file, "--parent", str(os.getpid())]
+    words += [word for endpoint in connect for word in ("--connect", endpoint)]
+    words += ["--clock", clock] if clock else []
+    words += ["--robots", ",".join(robots)]
+    return ProcessSpec("bridge", (*PROGRAM, *words))
+
+
+def bridge_identity(robots: Collection[str]) -> Identity:
+    """Whose keys the bridge of these robots uses: that of one robot the keys of its machine."""
+    return Identity(Role.ROBOT, *robots) if len(robots) == 1 else Identity(Role.BRIDGE)
 
 
 # Starting, watching and stopping them --------------------------------------------------------
@@ -112,10 +131,10 @@ def last_message(text: str) -> str:
 
 
 class _Child:
-    def __init__(self, spec: ProcessSpec, folder: Path) -> None:
+    def __init__(self, spec: ProcessSpec, folder: Path | None) -> None:
         self.spec, self.restarts, self.backoff_s = spec, 0, FIRST_BACKOFF_S
         self.due_s: float | None = None
-        self._log = folder / f"{spec.name}.log"
+        self._log = None if folder is None else folder / f"{spec.name}.log"
         self.process = self._start()
 
     def _start(self) -> "subprocess.Popen[bytes]":
@@ -125,11 +144,13 @@ class _Child:
                 self.spec.command,
                 stdin=subprocess.DEVNULL,
                 stdout=output,
-                stderr=subprocess.STDOUT,
+                stderr=output and subprocess.STDOUT,
                 start_new_session=True,  # Ctrl-C reaches the supervisor only
             )
 
-    def _open_log(self) -> BinaryIO:
+    def _open_log(self) -> AbstractContextManager[BinaryIO | None]:
+        if self._log is None:
+            return nullcontext()
         try:
             return self._log.open("ab")
         except OSError as error:  # better a process without a log than none
@@ -137,6 +158,8 @@ class _Child:
             return Path(os.devnull).open("wb")
 
     def _last_line(self) -> str:
+        if self._log is None:
+            return "see above"
         try:
             return last_message(self._log.read_text(errors="replace"))
         except OSError as error:
@@ -164,7 +187,8 @@ class _Child:
 class Supervisor:
     """The processes of a run; a context manager that leaves none behind."""
 
-    def __init__(self, table: Sequence[ProcessSpec], folder: Path) -> None:
+    def __init__(self, table: Sequence[ProcessSpec], folder: Path | None) -> None:
+        """`folder`: where they write their logs; None: to the outputs of this process."""
         self._table, self._folder = table, folder
         self._children: dict[str, _Child] = {}
 

@@ -5,12 +5,14 @@ argparse: typer and rich would cost each robot 8 MB of memory and a fifth of a s
 """
 
 import argparse
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 from cpcbl_agents.clock import Clock
 from cpcbl_launch.team.file import find_team
 from cpcbl_launch.team.requirements import require_endpoints, require_robots, require_team_opencv
+from cpcbl_team.config import Team
 from cpcbl_transport.bus import Bus
 
 DESCRIPTION = "Run one robot, on any machine, until SIGINT, SIGTERM or SIGHUP."
@@ -66,15 +68,40 @@ def run_robot_command(
     require_team_opencv(team, [arguments.name])
     require_endpoints("--connect", arguments.connect or ())
     clock = Clock.parse(arguments.clock) if arguments.clock else Clock.wall()
-    run_robot(
-        arguments.name,
-        team,
-        arguments.connect or team.transport.connect,
-        clock,
-        StopSignal(arguments.parent),
-        arguments.restarted,
-        lambda bus: wrap_bus(arguments.name, clock, bus),
-    )
+    connect = arguments.connect or team.transport.connect
+    with _bridged(arguments, team, connect, StopSignal(arguments.parent)) as stop:
+        run_robot(
+            arguments.name,
+            team,
+            connect,
+            clock,
+            stop,
+            arguments.restarted,
+            lambda bus: wrap_bus(arguments.name, clock, bus),
+        )
+
+
+@contextmanager
+def _bridged(
+    arguments: argparse.Namespace, team: Team, connect: Sequence[str], stop: Callable[[], bool]
+) -> Iterator[Callable[[], bool]]:
+    """Runs the robot's bridge to ROS 2 in a process of its own, if the team file asks for one.
+    `up` has one bridge for all robots that it starts. Yields `stop`, which also watches the bridge.
+    """
+    if team.ros2 is None or arguments.parent is not None:
+        yield stop
+        return
+    from cpcbl_launch.run.processes import Supervisor, bridge_spec  # no other robot needs it
+
+    names = [arguments.name]
+    spec = bridge_spec(str(arguments.team), connect, arguments.clock, names)
+    with Supervisor([spec], None) as supervisor:
+
+        def watch() -> bool:
+            supervisor.watch()
+            return stop()
+
+        yield watch
 
 
 def main(arguments: Sequence[str]) -> None:

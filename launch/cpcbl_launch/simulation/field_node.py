@@ -18,7 +18,7 @@ from cpcbl_agents.clock import Clock
 from cpcbl_agents.input_diagnosis.message_causes import MOST_SPEED_M_S, MOST_TURN_RATE_RAD_S
 from cpcbl_launch.simulation.field import SimulatedField
 from cpcbl_launch.simulation.guests import GuestBodies
-from cpcbl_launch.team.checks import endpoint_problem
+from cpcbl_launch.team.endpoints import endpoint_problem
 from cpcbl_launch.team.requirements import require_robots
 from cpcbl_team.config import Team
 from cpcbl_team.errors import InputError

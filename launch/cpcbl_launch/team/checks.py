@@ -1,8 +1,9 @@
 """Checks of a whole team: contradictions for which no single key of its file is to blame."""
 
-import re
 from collections.abc import Iterator
 
+from cpcbl_launch.team.endpoints import endpoint_problem
+from cpcbl_launch.team.ros2_checks import ros2_problems
 from cpcbl_launch.team.units import unit_warnings
 from cpcbl_team.config import LIKE_MIRRORED, MARKERS, Landmark, Team, Wall
 from cpcbl_team.relocalization import UNKNOWNS
@@ -33,6 +34,7 @@ def problems(team: Team) -> Iterator[str]:
     yield from _marker_problems(team)
     yield from _guard_problems(team)
     yield from _event_problems(team)
+    yield from ros2_problems(team)
     if not team.transport.connect:
         yield "transport.connect: is empty; name an endpoint such as tcp/192.168.1.10:7447"
     for key in ("listen", "connect"):
@@ -94,13 +96,6 @@ def _blind_team(team: Team) -> Iterator[str]:
         f"map.landmarks: no robot sees a landmark or has a position sensor, so all estimates get"
         f" worse while the robots drive; {fix}"
     )
-
-
-def endpoint_problem(text: str) -> str:
-    """Why Zenoh cannot listen or connect there; empty if it can."""
-    if re.fullmatch(r"(tcp|tls|quic|udp|ws)/.+:\d{1,5}", text):
-        return ""
-    return "no endpoint; write it as tcp/192.168.1.10:7447"
 
 
 def _vision_problems(team: Team) -> Iterator[str]:

@@ -6,7 +6,7 @@ from collections.abc import Collection, Iterable
 from pathlib import Path
 
 from cpcbl_agents.extras import install_command
-from cpcbl_launch.team.checks import endpoint_problem
+from cpcbl_launch.team.endpoints import endpoint_problem
 from cpcbl_team.config import Team
 from cpcbl_team.errors import DependencyError, InputError
 
