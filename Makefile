@@ -50,11 +50,11 @@ test-long: setup
 	$(BIN)/pytest -n 2 -m "long$(if $(CPCBL_MRCLAM), or log)$(if $(CPCBL_PICTURES), or pictures)"
 
 # Independent implementations of ROS 2, from wheels for Python 3.11, in a venv of their own.
+PARTNERS = build/ros2-partners
+PARTNERS_PYTHON ?= python3.11
 test-ros2: setup $(PARTNERS)/ready
 	CPCBL_ROS2=$(PARTNERS) $(BIN)/pytest -n 2 -m ros2 tests/ros2
 
-PARTNERS = build/ros2-partners
-PARTNERS_PYTHON ?= python3.11
 $(PARTNERS)/ready: tests/ros2/partners.txt
 	$(PARTNERS_PYTHON) -m venv $(PARTNERS)
 	$(PARTNERS)/bin/python -m pip install --quiet --disable-pip-version-check -r $<
