@@ -130,6 +130,7 @@ WAYS = {
     ),
     "cpcbl-team experiment table1 --seeds 20": Way(EXPERIMENT, "long", "--seeds 2"),
     "cpcbl-team experiment worlds": Way(EXPERIMENT, "long", "--seeds 1"),
+    "cpcbl-team bridge ros2 team.toml": LIVE._replace(says="in ROS 2 at", beside="router"),
     "cpcbl-team gateway team.toml": LIVE._replace(
         says="gateway of team lab", more="--listen :0", beside="router"
     ),
@@ -221,6 +222,7 @@ ELSEWHERE = {
     ),
     "docker/base-image.sh cpcbl-base": "tests/support/docker.py::base-image.sh",
     "export CPCBL_BASE_IMAGE=cpcbl-base": "tests/support/docker.py::LOCAL_BASE",
+    "pip install '.[ros2,camera]'": "Makefile::.[dev]",
     "pip install .": "tests/support/newcomer.py::def install",
     "now=$(date +%s%N)": f"{SNIPPETS}::test_the_shell_of_the_gateway",
     f"{CURL}/in/r1/odometry -d": f"{SNIPPETS}::test_the_shell_of_the_gateway",

@@ -91,6 +91,8 @@ USUAL = {
     "match.duration_s": Usual(10.0, 36_000.0, TIME),
     "simulation.step_rate_hz": Usual(1.0, 1000.0),
     "simulation.bump_radius_m": Usual(0.0, 5.0, LENGTH),
+    "ros2.fastest_m_s": Usual(0.05, 60.0, LENGTH),
+    "ros2.fastest_turn_rad_s": Usual(0.05, 100.0, DEGREES),
     "robot.speed_m_s": Usual(0.0, 20.0, LENGTH),
     "vision.marker_m": Usual(0.005, 2.0, LENGTH),
     "vision.marker_mounted_m": Usual(0.005, 5.0, LENGTH),

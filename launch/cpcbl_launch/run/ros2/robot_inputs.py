@@ -115,7 +115,7 @@ class RobotInputs:
         self.counts[topic] = self.counts.get(topic, 0) + 1
         self._arrived_s[topic] = time.monotonic()
         try:
-            taken = self._taken(row, message)
+            taken = self._input_of(row, message)
         except Exception as error:
             if topic not in self._has_failed:
                 log.exception("%s: a message could not be used", topic)
@@ -126,7 +126,7 @@ class RobotInputs:
         elif taken is not None:
             self._put(taken)
 
-    def _taken(self, row: InputTopic, message: Any) -> Taken:
+    def _input_of(self, row: InputTopic, message: Any) -> Taken:
         ros_ns, now_ns = stamp_of(message.header), self._now_ns()
         with self.lock:
             team_ns = self._stamps.team_ns(ros_ns, now_ns)

@@ -66,7 +66,7 @@ class SimulatedStamps:
                 return self._team_ns
             return self._team_ns + round(self._rate * (ros_ns - self._ros_ns))
         mapped_ns = self._team_ns + round(self._rate * (ros_ns - self._ros_ns))
-        self._follow(ros_ns, mapped_ns, now_ns, seconds)
+        self._adapt_rate(ros_ns, mapped_ns, now_ns, seconds)
         return self._team_ns
 
     def _begin(self, ros_ns: int, now_ns: int) -> None:
@@ -75,7 +75,7 @@ class SimulatedStamps:
         self._team_ns = max(self._team_ns + 1, now_ns)
         self._is_begun, self._lag_s = True, 0.0
 
-    def _follow(self, ros_ns: int, mapped_ns: int, now_ns: int, seconds: float) -> None:
+    def _adapt_rate(self, ros_ns: int, mapped_ns: int, now_ns: int, seconds: float) -> None:
         measured = (now_ns - self._arrived_ns) * 1e-9 / seconds
         error_s = (now_ns - mapped_ns) * 1e-9
         wanted = measured + error_s / CATCH_UP_S
