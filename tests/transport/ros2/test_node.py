@@ -290,9 +290,7 @@ def test_links_are_mutual_tls_with_credentials(tmp_path: Path) -> None:
             publisher = driver.publisher("r1/odom", ODOMETRY)
             node.subscribe("r1/odom", ODOMETRY, came.append)
             hears(node, "r1/odom")
-            wait_until(lambda: publisher.matching)
-            publisher.publish(node.types.new(ODOMETRY))
-            wait_until(lambda: bool(came))
+            publish_until(publisher, node.types.new(ODOMETRY), lambda: bool(came))
 
 
 def test_a_users_errors_have_one_line(router: str) -> None:
