@@ -4,8 +4,9 @@ import os
 import signal
 import subprocess
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
+from itertools import count
 from pathlib import Path
 from typing import NamedTuple
 
@@ -132,14 +133,14 @@ def nodes_of(node: RosNode) -> set[str]:
 
 
 def count_outputs(node: RosNode, names: list[str], heard: dict[str, int]) -> None:
-    def count(topic: str) -> None:
+    def note(topic: str) -> None:
         heard[topic] = heard.get(topic, 0) + 1
 
     wanted = [("diagnostics", types.DIAGNOSTICS), ("cpcbl/markers", types.MARKERS)]
     for name in names:
         wanted += [(f"{name}/amcl_pose", types.POSE), (f"{name}/tf", types.TRANSFORMS)]
     for topic, kind in wanted:
-        node.subscribe(topic, kind, lambda received: count(received.topic))
+        node.subscribe(topic, kind, lambda received: note(received.topic))
 
 
 def test_a_team_that_hears_ros_2_alone_localizes_and_gives_its_poses_back(tmp_path: Path) -> None:
@@ -225,9 +226,21 @@ def test_a_robot_starts_its_bridge_and_ends_it(tmp_path: Path) -> None:
         ros=(*PROGRAM, "router", str(path), "--listen", ros),
         robot=(*PROGRAM, "robot", str(path), "r1"),
     ) as running:
-        assert pass_odometry(team, ros)
-        assert eventually(lambda: "r1: first odometry" in running["robot"].said)
+        with open_node(NodeSettings(connect=(ros,))) as node:
+            assert eventually(robot_hears(node, running["robot"]))
         assert "node cpcbl_bridge_r1 in ROS 2" in running["robot"].said
+
+
+def robot_hears(node: RosNode, robot: Program) -> Callable[[], bool]:
+    """Publishes odometry of r1 each time that it is called; whether its process takes some."""
+    publisher, counter = node.publisher("r1/odom", types.ODOMETRY), count(1)
+
+    def is_heard() -> bool:
+        pose = Pose2(0.001 * next(counter), 0.0, 0.0)
+        publisher.publish(odometry(time.time_ns(), pose))
+        return "r1: first odometry" in robot.said
+
+    return is_heard
 
 
 def test_the_bridge_of_a_secured_team_has_a_certificate_of_its_own(tmp_path: Path) -> None:
@@ -247,14 +260,7 @@ def test_the_bridge_of_a_secured_team_has_a_certificate_of_its_own(tmp_path: Pat
         ) as running,
         open_node(NodeSettings(connect=(ros,))) as node,
     ):
-        publisher, n = node.publisher("r1/odom", types.ODOMETRY), 0
-
-        def has_come() -> bool:
-            nonlocal n
-            n += 1
-            publisher.publish(odometry(time.time_ns(), Pose2(0.001 * n, 0.0, 0.0)))
-            return "r1: first odometry" in running["robot"].said
-
+        has_come = robot_hears(node, running["robot"])
         assert eventually(has_come)
         heard: dict[str, int] = {}
         count_outputs(node, ["r1"], heard)
