@@ -121,6 +121,7 @@ class InputFacts(NamedTuple):
     camera_lost: bool = False
     unseen: str = ""  # why sightings should come that do not
     mistake: str = ""  # in sightings, that explains why the robot is lost
+    suspected_ns: int = -1  # the stamp since when sightings may have this mistake
 
 
 def input_problems(facts: InputFacts) -> tuple[str, ...]:
@@ -363,7 +364,7 @@ def contradicts_mistake(facts: InputFacts) -> bool:
     lost."""
     if not facts.mistake or not _odometry(facts):
         return False
-    shift = shift_of_frames(facts)
+    shift = shift_of_frames(facts, facts.suspected_ns)
     return shift is not None and contradicts_mistakes(shift)
 
 
