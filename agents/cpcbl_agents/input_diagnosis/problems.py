@@ -360,8 +360,7 @@ def _view_cause(
 
 
 def contradicts_mistake(facts: InputFacts) -> bool:
-    """Whether landmarks move so that no mistake in sightings is left that explains why the robot is
-    lost."""
+    """Whether landmarks have moved since then as no mistake in sightings lets them move."""
     if not facts.mistake or not _odometry(facts):
         return False
     shift = shift_of_frames(facts, facts.suspected_ns)
