@@ -61,14 +61,19 @@ def judged(*seconds: tuple[float, float, int]) -> list[str]:
 def test_only_motion_beyond_twice_the_confirmed_one_is_unusual(
     then: tuple[float, float, int], word: str
 ) -> None:
-    before, after = judged((0.4, 0.5, 5), then)
-    assert before == ""
+    *before, after = judged(*[(0.4, 0.5, 5)] * 3, then)
+    assert before == ["", "", ""]
     assert (word in after) if word else (after == "")
 
 
 def test_it_is_said_until_something_is_measured_which_then_confirms_the_motion() -> None:
-    said = judged((0.4, 0.0, 5), (2.0, 0.0, 0), (0.4, 0.0, 0), (2.0, 0.0, 4), (2.0, 0.0, 0))
+    said = judged((0.4, 0.0, 5), (2.1, 0.0, 0), (0.4, 0.0, 0), (2.1, 0.0, 4), (2.1, 0.0, 0))
     assert [bool(text) for text in said] == [False, True, True, False, False]
+
+
+def test_a_robot_that_was_measured_only_while_it_stood_may_drive_off() -> None:
+    assert judged(*[(0.0, 0.0, 5)] * 5, (1.9, 2.9, 0))[-1] == ""
+    assert "drives 2.1 m/s" in judged(*[(0.0, 0.0, 5)] * 5, (2.1, 0.0, 0))[-1]
 
 
 def test_a_robot_that_never_measured_anything_is_not_judged() -> None:

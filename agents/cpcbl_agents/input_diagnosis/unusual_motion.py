@@ -11,17 +11,36 @@ from typing import Final
 
 from cpcbl_agents.input_diagnosis.motion_causes import Step
 
-TIMES: Final = 2.0  # the largest confirmed one,
-LEAST_M_S: Final = 0.1  # or this, if that is less
-LEAST_RAD_S: Final = 0.2
+TIMES: Final = 2.0  # the largest confirmed speed or rate, or those below if they are larger
+NOTED: Final = 3  # judgements with a confirmed motion: from then on what it was is known
+KNOWN: Final = 0.25, 0.5  # m/s, rad/s
+UNKNOWN: Final = 1.0, 1.5  # before: a robot may have been confirmed only while it stood
+MOVING: Final = 0.05, 0.1
 WINDOW: Final = 5  # steps, of 0.1 s each, over which speeds are averaged
+
+
+class _Largest:
+    """The largest confirmed speed, or turn rate, of a robot."""
+
+    def __init__(self, kind: int) -> None:
+        """`kind`: 0 for speeds (m/s), 1 for rates (rad/s)."""
+        self._kind, self.value, self._noted = kind, 0.0, 0
+
+    def note(self, value: float) -> None:
+        """A measurement has confirmed this one."""
+        self.value = max(self.value, value)
+        self._noted += value > MOVING[self._kind]
+
+    def is_exceeded_by(self, value: float) -> bool:
+        least = (KNOWN if self._noted >= NOTED else UNKNOWN)[self._kind]
+        return value > TIMES * max(self.value, least)
 
 
 class UnusualMotion:
     """What odometry says of a robot's motion since the last measurement that was used."""
 
     def __init__(self) -> None:
-        self._speed_m_s = self._rate_rad_s = 0.0  # the largest ones that were confirmed
+        self._speed_m_s, self._rate_rad_s = _Largest(0), _Largest(1)
         self._accepted = self._judged_ns = 0
         self.reason = ""
 
@@ -35,21 +54,20 @@ class UnusualMotion:
         if is_measured or is_lost or not accepted:
             self.reason = ""
             if is_measured and not is_lost:
-                self._speed_m_s = max(self._speed_m_s, speed_m_s)
-                self._rate_rad_s = max(self._rate_rad_s, rate_rad_s)
-        elif speed_m_s > TIMES * max(self._speed_m_s, LEAST_M_S):
-            self.reason = self._text(f"drives {speed_m_s:.1f} m/s", f"{self._speed_m_s:.1f} m/s")
-        elif rate_rad_s > TIMES * max(self._rate_rad_s, LEAST_RAD_S):
-            most = f"{self._rate_rad_s:.1f} rad/s"
-            self.reason = self._text(f"turns {rate_rad_s:.1f} rad/s", most)
+                self._speed_m_s.note(speed_m_s)
+                self._rate_rad_s.note(rate_rad_s)
+        elif self._speed_m_s.is_exceeded_by(speed_m_s):
+            self.reason = _text(f"drives {speed_m_s:.1f} m/s", f"{self._speed_m_s.value:.1f} m/s")
+        elif self._rate_rad_s.is_exceeded_by(rate_rad_s):
+            most = f"{self._rate_rad_s.value:.1f} rad/s"
+            self.reason = _text(f"turns {rate_rad_s:.1f} rad/s", most)
 
-    @staticmethod
-    def _text(now: str, before: str) -> str:
-        return (
-            f"the pose is not confirmed: by its odometry the robot {now}, while measurements have"
-            f" confirmed {before} at most; it measures nothing now that would show whether this is"
-            " right"
-        )
+
+def _text(now: str, most: str) -> str:
+    return (
+        f"the pose is not confirmed: by its odometry the robot {now}, while measurements have"
+        f" confirmed {most} at most; it measures nothing now that would show whether this is right"
+    )
 
 
 def largest_speeds(steps: Sequence[Step]) -> tuple[float, float]:
