@@ -22,7 +22,7 @@ from cpcbl_agents.waypoint_follower import WaypointFollower
 from cpcbl_team.camera_filter import considers_camera
 from cpcbl_team.config import Team
 from cpcbl_team.estimate import Estimate
-from cpcbl_team.inputs import BeliefShared, InputsMended, SightingFault
+from cpcbl_team.inputs import BeliefShared, InitialPose, InputsMended, SightingFault
 from cpcbl_team.recovery import rejected_of
 from cpcbl_team.state import CalibrationMemory, Jump
 from cpcbl_team.trust import TrustStatus
@@ -43,6 +43,7 @@ class InputSnapshot(NamedTuple):
     mistake: str = ""  # of the driver, that explains why the robot is lost
     jump: Jump | None = None  # the latest
     rejected: tuple[int, int] = (0, 0)  # of the latest innovations, and how many these are
+    initial_pose: InitialPose | None = None  # the newest that somebody has set
 
 
 class Robot:
@@ -116,7 +117,7 @@ class Robot:
         pose = state.estimate, recovery.lost, known
         rejected = rejected_of(state.updates.innovations)
         found = recovery.mistake, recovery.jump, rejected
-        return InputSnapshot(*pose, refused, is_camera_lost, *found)
+        return InputSnapshot(*pose, refused, is_camera_lost, *found, self.filter.initial_pose)
 
     def pose(self, now_ns: int) -> Pose:
         """The pose at `now_ns`, or at the end of the newest odometry."""

@@ -9,12 +9,17 @@ from typing import Self
 from cpcbl_client.connection import SILENT_S, Connection, Reminder, log
 from cpcbl_client.team import ClientTeam, name_hint, read_team
 from cpcbl_team.errors import InputError
-from cpcbl_team.inputs import Odometry, Position, Sighting, Sightings
+from cpcbl_team.inputs import InitialPose, Odometry, Position, Sighting, Sightings
 from cpcbl_transport.bus import Bus, Publisher
 from cpcbl_transport.messages import LONGEST_ODOMETRY_NS, Frame, SensorInput, encode
 from cpcbl_transport.security import Identity
 from cpcbl_transport.topics import Role, topic_of
-from cpcbl_transport.units import odometry_problem, sighting_problem, stamp_problem
+from cpcbl_transport.units import (
+    initial_pose_problem,
+    odometry_problem,
+    sighting_problem,
+    stamp_problem,
+)
 
 PoseXYH = tuple[float, float, float]
 
@@ -116,6 +121,24 @@ class Driver:
         variance = float(sigma_m) ** 2
         place = float(x_m), float(y_m), (variance, 0.0, variance)
         self._put(Position(self._stamp(stamp_ns), *place))
+
+    def initial_pose(
+        self,
+        x_m: float,
+        y_m: float,
+        heading_rad: float,
+        sigma_m: float = 0.5,
+        heading_sigma_rad: float = math.radians(15.0),
+        *,
+        stamp_ns: int | None = None,
+    ) -> None:
+        """Where the robot is, as somebody says: it replaces what the robot believed. The σ are
+        those of RViz, where a person gives the pose with the mouse."""
+        p, h = float(sigma_m) ** 2, float(heading_sigma_rad) ** 2
+        pose = float(x_m), float(y_m), float(heading_rad)
+        given = InitialPose(self._stamp(stamp_ns), *pose, (p, 0.0, p, 0.0, 0.0, h))
+        _require(initial_pose_problem(given))
+        self._put(given)
 
     def frame(self, image: bytes, *, stamp_ns: int | None = None) -> None:
         """A camera image (JPEG or PNG) at the time of its exposure."""
