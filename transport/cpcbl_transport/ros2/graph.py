@@ -29,9 +29,13 @@ class Interest(msgspec.Struct, frozen=True, kw_only=True):
     """Those that can be read (subscription), or the one that is written (publisher)."""
     messages: int = 0
     """How many messages arrived under the topic's key, whether or not they could be read."""
+    is_optional: bool = False
+    """Whether any number of nodes may publish it, or none, at any time."""
 
 
-def interest_in(endpoint: Endpoint, hashes: frozenset[str], messages: int = 0) -> Interest:
+def interest_in(
+    endpoint: Endpoint, hashes: frozenset[str], messages: int = 0, is_optional: bool = False
+) -> Interest:
     """The interest of an endpoint of this node."""
     assert endpoint.qos is not None, "every topic has a quality of service"
     return Interest(
@@ -41,6 +45,7 @@ def interest_in(endpoint: Endpoint, hashes: frozenset[str], messages: int = 0) -
         qos=endpoint.qos,
         type_hashes=hashes,
         messages=messages,
+        is_optional=is_optional,
     )
 
 
@@ -113,6 +118,8 @@ def _subscription_findings(
     publishers = [endpoint for endpoint in others if endpoint.entity is Entity.PUBLISHER]
     here = [endpoint for endpoint in publishers if _is_here(endpoint, context)]
     mine = [endpoint for endpoint in here if endpoint.topic == interest.topic]
+    if not mine and interest.is_optional:
+        return
     if not mine:
         yield _unpublished(interest, publishers, here, context)
         return
@@ -124,6 +131,8 @@ def _subscription_findings(
             continue
         readable.append(publisher)
         yield from _qos_problems(interest, publisher, publisher.qos, interest.qos, context)
+    if interest.is_optional:
+        return
     if len(readable) > 1:
         nodes = _some(endpoint.full_node_name for endpoint in readable)
         yield f"{interest.topic}: has {len(readable)} publishers, and all are heard: {nodes}"

@@ -106,9 +106,11 @@ class RosNode:
         on_message: ReceivedCallback,
         qos: QosProfile = SENSOR_DATA,
         largest_bytes: int = 0,
+        is_optional: bool = False,
     ) -> Subscription:
         """Subscribes to a topic, whichever distribution its publishers are of. Payloads beyond
-        `largest_bytes` are refused (0: what its type usually needs). Raises RosNameError.
+        `largest_bytes` are refused (0: what its type usually needs). That nobody publishes an
+        optional topic is no finding. Raises RosNameError.
 
         Behind zenoh-bridge-ros2dds it is not announced, so that the bridge takes the quality of
         service of the robot's publisher, which always matches it.
@@ -117,7 +119,7 @@ class RosNode:
         settings, name = self.settings, endpoint.type_name
         keys = topic_key(settings.layout, settings.domain, endpoint.topic, name, "*")
         limit = largest_bytes or largest_payload(name)
-        subscription = Subscription(endpoint, on_message, self.types, limit)
+        subscription = Subscription(endpoint, on_message, self.types, limit, is_optional)
         handles = [self._session.subscribe(keys, qos, subscription.on_sample)]
         if settings.layout is Layout.RMW_ZENOH:
             handles.append(self._session.declare_token(tokens.format_token(endpoint)))
