@@ -32,7 +32,7 @@ from cpcbl_launch.run.containers.launch import (
 )
 from cpcbl_launch.run.processes import PROGRAM
 from cpcbl_launch.team.file import builtin_path, load_team
-from cpcbl_team.config import Ros2Settings, Team
+from cpcbl_team.config import Team
 from cpcbl_team.errors import InputError
 
 DEMO = load_team(builtin_path("demo"))
@@ -105,33 +105,6 @@ def test_only_a_team_with_cameras_needs_opencv_in_its_image() -> None:
     assert "EXTRAS" not in services(DEMO, how)["router"]["build"]["args"]
     seeing = services(load_team(builtin_path("eyes")), how)
     assert seeing["router"]["build"]["args"]["EXTRAS"] == "camera"
-
-
-def test_a_team_with_ros_2_has_a_bridge_beside_its_robots() -> None:
-    team = replace(team_of(a=robot_at(), b=robot_at()), ros2=Ros2Settings())
-    found = services(team, HOW._replace(context=".."))
-    assert list(found) == ["router", "robot-a", "robot-b", "bridge"]
-    to_router = ["--connect", "tcp/router:7447"]
-    assert found["bridge"]["command"] == ["bridge", "ros2", "demo", *to_router, "--robots", "a,b"]
-    assert found["router"]["build"]["args"]["EXTRAS"] == "ros2"
-    tagged = replace(team, robots={**team.robots, "c": replace(robot_at(), markers={"front": 0})})
-    built = services(tagged, HOW._replace(context=".."))["router"]["build"]
-    assert built["args"]["EXTRAS"] == "camera ros2"  # its tags are detected by apriltag_ros
-
-
-@pytest.mark.parametrize(
-    ("ros2", "said"),
-    [
-        (Ros2Settings(connect=("tcp/127.0.0.1:7448",)), "that is the container itself"),
-        (Ros2Settings(connect=("tls/host:7448",), keys="keys"), "does not have them"),
-    ],
-)
-def test_a_bridge_that_could_not_work_in_a_container_is_refused(
-    ros2: Ros2Settings, said: str
-) -> None:
-    with pytest.raises(InputError, match=said):
-        services(replace(team_of(a=robot_at()), ros2=ros2))
-    services(replace(team_of(a=robot_at()), ros2=Ros2Settings(connect=("tcp/10.0.0.2:7447",))))
 
 
 def test_what_yaml_or_compose_would_take_for_something_else_stays_what_it_is() -> None:

@@ -88,13 +88,22 @@ class RosNode:
         for keys in (tokens.RMW_ZENOH_TOKENS, tokens.ROS2DDS_TOKENS):
             session.watch_liveliness(keys, self._on_token)
 
-    def publisher(self, topic: str, type_name: str, qos: QosProfile = DEFAULT) -> RosPublisher:
-        """Announces a topic that this node publishes. Raises RosNameError."""
+    def publisher(
+        self,
+        topic: str,
+        type_name: str,
+        qos: QosProfile = DEFAULT,
+        is_exclusive: bool = False,
+    ) -> RosPublisher:
+        """Announces a topic that this node publishes; that another one publishes an exclusive one
+        too is a finding. Raises RosNameError."""
         endpoint, key = self._topic(Entity.PUBLISHER, topic, type_name, qos)
         token = tokens.format_token(endpoint)
         declared = self._session.publisher(key, qos)
         handle = self._session.declare_token(token)
-        publisher = RosPublisher(endpoint, gid_of(token), declared, handle, self.types)
+        publisher = RosPublisher(
+            endpoint, gid_of(token), declared, handle, self.types, is_exclusive
+        )
         with self._lock:
             self._publishers.append(publisher)
         return publisher

@@ -135,4 +135,5 @@ class Subscription:
         with self._lock:
             messages = self._messages
         hashes = self._types.readable_hashes(self._endpoint.type_name)
-        return interest_in(self._endpoint, hashes, messages, self._is_optional)
+        facts = {"messages": messages, "is_optional": self._is_optional}
+        return interest_in(self._endpoint, hashes, **facts)

@@ -26,10 +26,15 @@ class Output:
     """One topic of ROS 2 that takes dictionaries."""
 
     def __init__(
-        self, node: RosNode, topic: str, type_name: str, qos: QosProfile = DEFAULT
+        self,
+        node: RosNode,
+        topic: str,
+        type_name: str,
+        qos: QosProfile = DEFAULT,
+        is_exclusive: bool = False,
     ) -> None:
         self._types, self._type_name = node.types, type_name
-        self._publisher = node.publisher(topic, type_name, qos)
+        self._publisher = node.publisher(topic, type_name, qos, is_exclusive)
 
     def put(self, fields: Fields) -> None:
         """Publishes a message with these fields."""
@@ -53,7 +58,8 @@ class RobotOutputs:
         ) -> Callable[[Fields], None]:
             if not topic:
                 return lambda fields: None
-            return Output(node, ros2.topic(name, topic), type_name, qos).put
+            is_pose = type_name != types.TRANSFORMS
+            return Output(node, ros2.topic(name, topic), type_name, qos, is_pose).put
 
         has_odometry = inputs is not None and settings.odometry.moves
         self._pose = output(keys.pose, types.POSE)
