@@ -18,6 +18,7 @@ from cpcbl_team.inputs import (
     Belief,
     BeliefShared,
     Fix,
+    InitialPose,
     InputsMended,
     Odometry,
     Position,
@@ -357,6 +358,11 @@ class Localizer:
         return state if self._camera is None else self._camera.started(state)
 
     # The start --------------------------------------------------------------------------------
+
+    def set_pose(self, state: State, given: InitialPose) -> State:
+        """Somebody says where the robot is: nothing is left of what it believed."""
+        state = self.predict(state, given.stamp_ns)
+        return self.recovery.check(self.recovery.with_given_pose(state, given))
 
     def start(self, stamp_ns: int) -> State:
         """The state at the start: at the configured pose, or lost somewhere on the field."""

@@ -11,6 +11,8 @@ from typing import Final, NamedTuple
 
 from cpcbl_team.config import Field, LocalizationSettings, LocalizerSettings
 from cpcbl_team.estimate import Covariance3, Estimate
+from cpcbl_team.initial_pose import estimate_of
+from cpcbl_team.inputs import InitialPose
 from cpcbl_team.landmarks import Landmarks
 from cpcbl_team.map_rejections import MapRejections
 from cpcbl_team.miscalibration import (
@@ -20,6 +22,7 @@ from cpcbl_team.miscalibration import (
 )
 from cpcbl_team.recovery_evidence import WINDOW_NS, latest
 from cpcbl_team.relocalization import UNKNOWNS, are_apart, readings_of, relocalize
+from cpcbl_team.sender_comparisons import SenderRecords
 from cpcbl_team.sensor_mistakes import (
     MIRRORED,
     ExplainingMistake,
@@ -33,7 +36,7 @@ from cpcbl_team.state import (
     with_common_errors,
     with_recovery,
 )
-from cpcbl_team.trust import reset_scores
+from cpcbl_team.trust import forget_reports, reset_scores
 from cpcbl_team.trusted_pose import (
     agrees,
     expected_pose,
@@ -268,14 +271,32 @@ class Recovery:
         return with_recovery(state, memory._replace(lost="", kidnapped_ns=-1))
 
     def _found(self, state: State, estimate: Estimate, recovery: RecoveryMemory) -> State:
-        """The state of a robot that is found again: here everything begins anew."""
-        _, teammates, calibration, _ = memory = state.memory.counted("found_again")
+        """The state of a robot that is found again."""
+        recovery = with_jump(state, recovery, estimate.pose)._replace(
+            lost="", kidnapped_ns=-1, suspected_ns=-1
+        )
+        senders = reset_scores(state.memory.teammates.senders)
+        state = state.counted("found_again")
+        return self._begun_anew(state, estimate, recovery, senders)
+
+    def with_given_pose(self, state: State, given: InitialPose) -> State:
+        """The state of a robot whose pose somebody sets. What it measured before may have been
+        measured elsewhere. If it believed to be elsewhere, teammates that disagreed with it may
+        have been right."""
+        estimate, senders = estimate_of(given), state.memory.teammates.senders
+        if not agrees(state.estimate, estimate):
+            senders = forget_reports(senders, state.stamp_ns)
+        return self._begun_anew(state, estimate, RecoveryMemory(), senders)
+
+    def _begun_anew(
+        self, state: State, estimate: Estimate, recovery: RecoveryMemory, senders: SenderRecords
+    ) -> State:
+        """The state of a robot that begins anew with an estimate that its former one is not in."""
+        _, teammates, calibration, _ = memory = state.memory
         common = calibration.common
         memory = memory._replace(
-            recovery=with_jump(state, recovery, estimate.pose)._replace(
-                lost="", kidnapped_ns=-1, suspected_ns=-1
-            ),
-            teammates=teammates._replace(senders=reset_scores(teammates.senders)),
+            recovery=recovery,
+            teammates=teammates._replace(senders=senders),
             calibration=calibration._replace(
                 references=None,
                 check=calibration.check.restarted(state.updates.accepted),

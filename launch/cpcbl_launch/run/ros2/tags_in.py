@@ -26,7 +26,7 @@ from cpcbl_agents.vision.markers import (
 from cpcbl_agents.vision.poses import Lean, PoseFit, fit_pose
 from cpcbl_launch.run.ros2.camera_info import RosCamera, camera_of_info, is_rotated
 from cpcbl_launch.run.ros2.refused import BadMessage, Refused, is_finite
-from cpcbl_team.config import Side, Team, VisionSettings
+from cpcbl_team.config import CameraSettings, Side, Team, VisionSettings
 from cpcbl_team.inputs import Sighting, Sightings
 
 LEAST_SIDE_PX = 4.0
@@ -38,12 +38,18 @@ class TagInput:
     """The tags that one robot detects."""
 
     def __init__(
-        self, robot: str, team: Team, note: Callable[[Refused], None] = lambda refused: None
+        self,
+        robot: str,
+        team: Team,
+        note: Callable[[Refused], None] = lambda refused: None,
+        mounted: Callable[[str], CameraSettings] | None = None,
     ) -> None:
-        """`note` is told of tags that are left out."""
+        """`note` is told of tags that are left out. `mounted`: the camera whose messages are of a
+        frame; None: that of the team file."""
         self._robot, self._team, self._note = robot, team, note
         settings = team.robots[robot]
-        self._mounted, self._rectified = settings.camera, settings.ros2.rectified
+        self._rectified = settings.ros2.rectified
+        self._mounted = mounted or (lambda frame: settings.camera)
         self._mounts: dict[int, list[MarkerMount]] = defaultdict(list)
         for name, other in team.robots.items():
             for side, number in other.markers.items():
@@ -57,7 +63,7 @@ class TagInput:
                 marker_mounted_m=tag.mounted_m or team.vision.marker_mounted_m,
                 marker_distance_m=0.0,
             )
-        leans = (self._mounted.tilt_sigma_deg, self._mounted.roll_sigma_deg)
+        leans = (settings.camera.tilt_sigma_deg, settings.camera.roll_sigma_deg)
         self._fits = MarkerFits(Lean(*map(math.radians, leans)))
         self._camera: RosCamera | None = None
         self._info: tuple[Any, ...] = ()
@@ -70,10 +76,12 @@ class TagInput:
 
     def take_camera_info(self, info: Any) -> Refused | None:
         """The camera as it is from now on."""
-        same = (*info.k, *info.d, *info.p, int(info.width), int(info.height), int(info.binning_x))
+        mounted = self._mounted(str(info.header.frame_id))
+        size = int(info.width), int(info.height), int(info.binning_x)
+        same = (*info.k, *info.d, *info.p, *size, mounted)
         if same == self._info and self._camera is not None:
             return None
-        found = camera_of_info(info, self._mounted, self._rectified)
+        found = camera_of_info(info, mounted, self._rectified)
         if isinstance(found, Refused):
             return found
         if self._rectified and is_rotated(info.r):
