@@ -5,6 +5,7 @@ from collections import Counter
 from collections.abc import Sequence
 
 from cpcbl_agents.input_diagnosis.problems import without_numbers
+from cpcbl_agents.robot_state import RobotState, robot_state
 from cpcbl_team.config import Team
 from cpcbl_transport.messages import InputHealth, Status
 
@@ -43,13 +44,15 @@ class RobotLogger:
             if flow.peer not in self._heard:
                 self._heard.add(flow.peer)
                 log.info("%s: first help from %s", self._robot, flow.peer)
-        if (lost := without_numbers(status.lost)) != self._lost:
+        state = robot_state(status)
+        lost = without_numbers(state.why) if state.word == "lost" else ""
+        if lost != self._lost:
             self._lost = lost
-            self._log_pose(status)
-        if (what := without_numbers(status.unconfirmed)) != self._unconfirmed and not lost:
+            self._log_pose(state, status.position_sigma_m)
+        if (what := without_numbers(state.unconfirmed)) != self._unconfirmed and not lost:
             self._unconfirmed = what
-            log.info("%s: %s", self._robot, status.unconfirmed or "its pose is confirmed")
-        problems = {without_numbers(text): text for text in status.problems}
+            log.info("%s: %s", self._robot, state.unconfirmed or "its pose is confirmed")
+        problems = {without_numbers(text): text for text in state.problems}
         for what, text in problems.items():
             if what not in self._problems:
                 log.warning("%s: %s", self._robot, text)
@@ -68,9 +71,8 @@ class RobotLogger:
                 log.info("%s: somebody has set its pose", self._robot)
         self._initial_poses = now
 
-    def _log_pose(self, status: Status) -> None:
-        if status.lost:
-            log.warning("%s: does not know its pose: %s", self._robot, status.lost)
+    def _log_pose(self, state: RobotState, sigma_m: float) -> None:
+        if state.word == "lost":
+            log.warning("%s: does not know its pose: %s", self._robot, state.why)
         else:
-            sigma_m = status.position_sigma_m
             log.info("%s: knows its pose, position σ %.2f m", self._robot, sigma_m)

@@ -43,7 +43,13 @@ collaboration = {{ budget = {{ bytes_per_s = {MISER_BYTES_PER_S} }} }}
 
 
 def status(robot: str, at_s: float, tier: int, incarnation: str = "1", **more: Any) -> Status:
-    health = (0.01 * (tier + 1), 0.1, tier, more.pop("lost", ""), {"announced": 2})
+    health = (
+        0.01 * (tier + 1),
+        0.1,
+        tier,
+        more.pop("lost", ""),
+        more.pop("counts", {"announced": 2}),
+    )
     return Status(robot, incarnation, int(at_s * SECOND), *health, 0, 0, 0, 0, **more)
 
 

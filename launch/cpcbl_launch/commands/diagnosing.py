@@ -12,7 +12,7 @@ from rich.text import Text
 from typer import Exit, Option
 
 from cpcbl_launch.commands import options
-from cpcbl_launch.reporting.tables import table
+from cpcbl_launch.reporting.tables import STYLES, table
 from cpcbl_launch.team.file import find_team
 from cpcbl_launch.team.requirements import require_robots
 from cpcbl_launch.views.listening import TeamHeard
@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 
 Duration = Annotated[float, Option(callback=options.duration, help="Seconds to listen.")]
 Wait = Annotated[float, Option(min=0.1, help="Seconds to wait for a router.")]
-STYLES = {"good": "green", "note": "dim", "warning": "yellow", "error": "bold red"}
 
 
 def doctor(

@@ -1,14 +1,14 @@
 """What the statuses of a robot's processes come to, for reports and people: traffic and trust."""
 
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from itertools import chain
 
 import msgspec
 
 from cpcbl_agents.input_diagnosis.problems import without_numbers
-from cpcbl_team.map_rejections import MISPLACED
-from cpcbl_transport.messages import Flow, Spending, Status, Trust
+from cpcbl_agents.robot_state import distrust_reason
+from cpcbl_transport.messages import Flow, Spending, Status
 
 
 class FlowReport(msgspec.Struct, frozen=True, kw_only=True):
@@ -80,11 +80,6 @@ class ProblemReport(msgspec.Struct, frozen=True, kw_only=True):
 
 
 MOST_PROBLEMS = 100  # of one robot; they may have free names in them
-
-
-def shortcomings(status: Status) -> tuple[str, ...]:
-    """The problems of a robot, and what is not confirmed about its pose."""
-    return (*status.problems, *filter(None, [status.unconfirmed]))
 
 
 class ProblemLog:
@@ -173,62 +168,12 @@ def trust_reports(statuses: Sequence[Status]) -> tuple[TrustReport, ...]:
     return tuple(msgspec.structs.replace(t, quarantines=quarantines[t.peer]) for t in last)
 
 
-def distrust_text(trust: Iterable[Trust | TrustReport]) -> str:
-    """`distrusts west (biased), r4 (clock 0.45 s ahead)`, or `contested: north, south`; empty where
-    all are believed."""
-    all_of_it = tuple(trust)
-    named = [f"{t.peer} ({_reason_text(t)})" for t in all_of_it if t.reason]
-    contested = [t.peer for t in all_of_it if t.contested and not t.reason]
-    texts = [f"distrusts {', '.join(named)}"] if named else []
-    texts += [f"contested: {', '.join(contested)}"] if contested else []
-    return "; ".join(texts)
-
-
-def miscalibration_text(counts: Mapping[str, int], learned: object | None) -> str:
-    """`σ of its odometry × 2.1, 13.0% of observations rejected`: why a robot is called
-    miscalibrated; empty if it is not, or no longer. Scales that it has `learned` are not in it."""
-    texts = [
-        f"σ of its {what} × {counts[name] / 100.0:.1f}"
-        for what in ("odometry", "sensor")
-        if (name := f"{what}_sigma_percent") in counts
-    ]
-    if (percent := counts.get("range_percent")) is not None:
-        texts.append(f"ranges × {percent / 100.0:.2f}")
-    texts += [
-        f"ranges {sign} {counts[name] / 1000.0:.2f} m"
-        for sign, word in (("+", "plus"), ("-", "minus"))
-        if (name := f"range_{word}_mm") in counts
-    ]
-    if not counts.get("miscalibrated") or not (texts or learned):
-        return ""
-    used, rejected = counts.get("accepted", 0), counts.get("gated", 0)
-    texts.append(f"{rejected / max(used + rejected, 1):.1%} of observations rejected")
-    return ", ".join(texts)
-
-
-def learned_text(distance_scale: float, turn_scale: float, bearing_bias_deg: float) -> str:
-    """`distance × 0.98, turn × 0.96, bearings -0.6°`: what a robot does to its readings."""
-    turned = f"bearings {-bearing_bias_deg:+z.1f}°"
-    return f"distance × {distance_scale:.2f}, turn × {turn_scale:.2f}, {turned}"
-
-
-def misplaced_objects(counts: Mapping[str, int]) -> Iterator[str]:
-    """The objects of the map that a robot finds elsewhere (docs/team_file.md)."""
-    return (name.removeprefix(MISPLACED) for name in counts if name.startswith(MISPLACED))
-
-
-def _reason_text(t: Trust | TrustReport) -> str:
-    if t.reason != "clock":
-        return t.reason
-    return f"clock {-t.late_s:.2f} s ahead" if t.late_s < 0.0 else f"{t.late_s:.2f} s late"
-
-
 def trust_remarks(robot: str, trust: Iterable[TrustReport]) -> Iterator[str]:
     """What a report says of it, in words."""
     for t in trust:
         times = f"{t.quarantines} times" if t.quarantines != 1 else "once"
         if t.reason:
-            yield f"robot {robot} does not believe {t.peer}: {_reason_text(t)}"
+            yield f"robot {robot} does not believe {t.peer}: {distrust_reason(t)}"
         elif t.contested:
             yield f"robot {robot} cannot decide whether {t.peer} is right: no majority"
         elif t.quarantines:

@@ -5,6 +5,8 @@ from collections.abc import Mapping, Sequence
 from rich import box
 from rich.table import Table
 
+STYLES = {"good": "green", "note": "dim", "warning": "yellow", "error": "bold red"}
+
 
 def table(title: str, left: Sequence[str], right: Sequence[str]) -> Table:
     """Names on the left, figures on the right; at most 80 columns is the caller's duty."""

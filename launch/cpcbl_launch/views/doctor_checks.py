@@ -6,6 +6,7 @@ from typing import Literal
 
 import msgspec
 
+from cpcbl_agents.robot_state import robot_state
 from cpcbl_launch.team.faults import one_line
 from cpcbl_launch.views.doctor_facts import Facts
 from cpcbl_launch.views.listening import (
@@ -179,15 +180,18 @@ def _health(facts: Facts) -> Iterator[tuple[Level, str, str]]:
     heard = _own_team(facts)
     for name, processes in heard.statuses.items() if heard else ():
         status = processes[-1].status
-        problems: tuple[str, ...] = getattr(status, "problems", ())
-        for problem in problems:
-            yield "error", f"{name}: {problem}", "docs/refused_inputs.md"
-        if status.lost:
+        state = robot_state(status)
+        for problem in state.problems:
+            if problem in status.problems:
+                yield "error", f"{name}: {problem}", "docs/refused_inputs.md"
+            else:
+                yield "warning", f"{name}: {problem}", "docs/trust.md, docs/calibration.md"
+        if state.word == "lost":
             remedy = "it needs landmarks or a teammate in sight, or a start"
-            yield "warning", f"{name}: is lost ({status.lost})", remedy
-        elif status.unconfirmed:
-            yield "warning", f"{name}: {status.unconfirmed}", "docs/refused_inputs.md"
-        if not problems and not status.lost and not status.unconfirmed:
+            yield "warning", f"{name}: is lost ({state.why})", remedy
+        elif state.unconfirmed:
+            yield "warning", f"{name}: {state.unconfirmed}", "docs/refused_inputs.md"
+        elif state.word == "ok":
             yield "good", f"{name}: σ {status.position_sigma_m:.3f} m, tier {status.tier}", ""
 
 

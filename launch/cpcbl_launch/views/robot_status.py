@@ -7,22 +7,19 @@ import msgspec
 from rich.console import Group, RenderableType
 from rich.text import Text
 
+from cpcbl_agents.robot_state import SEVERITIES, Word, robot_state
 from cpcbl_launch.reporting.statuses import (
     FlowReport,
     SpendingReport,
     TrustReport,
-    distrust_text,
-    learned_text,
-    miscalibration_text,
     summed_flows,
     summed_spending,
     trust_reports,
 )
-from cpcbl_launch.reporting.tables import number, short, table, times
+from cpcbl_launch.reporting.tables import STYLES, number, short, table, times
 from cpcbl_launch.team.faults import one_line
 from cpcbl_launch.views.listening import InputHeard, TeamHeard, clock_problem
 from cpcbl_launch.views.traffic_tables import limit_text
-from cpcbl_launch.views.web.page_data import State
 from cpcbl_team.config import Team
 from cpcbl_transport.messages import Status
 
@@ -42,7 +39,7 @@ class RobotStatus(msgspec.Struct, frozen=True, kw_only=True):
     """What `status --json` writes of a robot."""
 
     robot: str
-    state: State  # in the words of the page
+    state: Word
     alive: bool  # its liveliness token is there
     processes: int  # that run under its name; more than one is a mistake
     status_offset_s: float | None  # arrival minus stamp of its status; None: none came
@@ -71,10 +68,15 @@ def _robot_status(name: str, heard: TeamHeard, is_real: bool) -> RobotStatus:
     processes = heard.statuses.get(name, ())
     last = processes[-1] if processes else None
     status = last.status if last else None
-    problems = tuple(map(one_line, _problems(name, status, heard, is_real)))
+    state = robot_state(
+        status,
+        is_alive=name in heard.alive,
+        ended_s=math.inf if name in heard.gone else None,
+        observed=[*_observed(name, status, heard, is_real)],
+    )
     return RobotStatus(
         robot=name,
-        state=_state_of(name, status, heard, bool(problems)),
+        state=state.word,
         alive=name in heard.alive,
         processes=heard.twice.get(name, int(name in heard.robots)),
         status_offset_s=last.offset_s if last else None,
@@ -83,7 +85,7 @@ def _robot_status(name: str, heard: TeamHeard, is_real: bool) -> RobotStatus:
         tier=status.tier if status else None,
         lost=status.lost if status else "",
         unconfirmed=status.unconfirmed if status else "",
-        problems=problems,
+        problems=tuple(one_line(t) for t in state.reasons if t != state.unconfirmed),
         inputs=tuple(_inputs(name, status, heard)),
         counts=dict(sorted(status.counts.items())) if status else {},
         spending=summed_spending([status.spending] if status else []),
@@ -93,45 +95,17 @@ def _robot_status(name: str, heard: TeamHeard, is_real: bool) -> RobotStatus:
     )
 
 
-def _state_of(name: str, status: Status | None, heard: TeamHeard, has_problems: bool) -> State:
-    """`gone`: its process or its link ended; `waiting`: it has sent nothing so far."""
-    if status is None:
-        return "gone" if name in heard.gone else "waiting"
-    if status.lost:
-        return "lost"
-    if has_problems:
-        return "problem"
-    return "unconfirmed" if status.unconfirmed else "ok"
-
-
-def _problems(name: str, status: Status | None, heard: TeamHeard, is_real: bool) -> Iterator[str]:
+def _observed(name: str, status: Status | None, heard: TeamHeard, is_real: bool) -> Iterator[str]:
+    """What this machine finds of a robot that the robot itself does not say."""
     if name in heard.twice:
         yield f"{heard.twice[name]} processes have this name"
-    problems: tuple[str, ...] = getattr(status, "problems", ())
-    yield from problems
-    for own in heard.inputs if not problems else ():  # the robot itself knows more of them
-        if own.robot == name and own.refused:
-            yield f"in/{name}/{own.input}: cannot be used: {_words(own.refused)}"
-    if status is None:
-        if name in heard.alive:
-            yield "alive, but sends no status"
-        elif name in heard.gone:
-            yield "gone: its process or its link ended"
-        else:
-            yield "sends no status"
-        return
-    clock = clock_problem(heard.statuses[name][-1].offset_s)
+    if status is None or not status.problems:  # else the robot itself knows more of them
+        for own in heard.inputs:
+            if own.robot == name and own.refused:
+                yield f"in/{name}/{own.input}: cannot be used: {_words(own.refused)}"
+    clock = clock_problem(heard.statuses[name][-1].offset_s) if name in heard.statuses else ""
     if clock and is_real:
         yield clock
-    if status.lost:
-        yield f"lost: {status.lost}"
-    if text := distrust_text(status.trust):
-        yield text
-    if text := miscalibration_text(status.counts, status.learned):
-        if status.learned is not None:
-            distance, turn, bias_rad = status.learned
-            text = f"{learned_text(distance, turn, math.degrees(bias_rad))}, {text}"
-        yield f"miscalibrated: {text}"
 
 
 def _inputs(name: str, status: Status | None, heard: TeamHeard) -> Iterator[InputStatus]:
@@ -170,22 +144,12 @@ def team_view(robots: Collection[RobotStatus]) -> RenderableType:
             rates.get("odometry", "-"),
             rates.get("sightings", "-"),
             short(refused),
-            Text(robot.state, _STYLES[robot.state]),
+            Text(robot.state, STYLES[SEVERITIES[robot.state]]),
         )
         lines += [Text(f"{robot.robot}: {problem}", "red") for problem in robot.problems]
         if robot.unconfirmed:
             lines.append(Text(f"{robot.robot}: {robot.unconfirmed}", "yellow"))
     return Group(shown, *lines)
-
-
-_STYLES = {
-    "ok": "green",
-    "unconfirmed": "yellow",
-    "problem": "yellow",
-    "lost": "red",
-    "gone": "red",
-    "waiting": "yellow",
-}
 
 
 def _words(reasons: dict[str, int]) -> str:

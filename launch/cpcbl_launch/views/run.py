@@ -2,7 +2,7 @@
 
 import math
 import time
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
 from statistics import fmean
 
@@ -11,33 +11,34 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 from rich.text import Text
 
+from cpcbl_agents.robot_state import (
+    RobotState,
+    learned_text,
+    miscalibration_text,
+    misplaced_objects,
+    robot_state,
+)
 from cpcbl_launch.reporting.metrics import ErrorFigures
 from cpcbl_launch.reporting.phases import AWAY_S
 from cpcbl_launch.reporting.recorder import Effect, GuestReport, Recorder, Report, RobotReport
 from cpcbl_launch.reporting.statuses import (
-    distrust_text,
-    learned_text,
-    miscalibration_text,
-    misplaced_objects,
     problem_remarks,
-    shortcomings,
     trust_remarks,
 )
-from cpcbl_launch.reporting.tables import number, percent, short, table, times
+from cpcbl_launch.reporting.tables import STYLES, number, percent, short, table, times
 from cpcbl_launch.run.observer import ObserverReport
 from cpcbl_launch.run.processes import ROBOT, Processes
 from cpcbl_launch.views.live import LiveView
 from cpcbl_launch.views.own_figures import own_figures_table
 from cpcbl_launch.views.traffic_tables import COLUMNS_EXPLAINED, help_traffic_table, limits_text
 from cpcbl_team.tiers import LOWEST_TIER
-from cpcbl_transport.messages import Status, Track
+from cpcbl_transport.messages import Track
 
 NARROW = 61  # columns of a terminal, with which a table does without its less important ones
 WITHOUT = ("before m", "mean m", "max m", "out", "B")
 FIGURES = ("RMSE m", "mean m", "max m", "deg", "in 3 σ", "NEES")
 ProgressSetter = Callable[[float], None]
 Cell = str | Text
-SILENT_S = 3.0  # real time without a track
 
 
 class LiveTable(LiveView):
@@ -59,22 +60,42 @@ class LiveTable(LiveView):
     def _table_and_problems(
         self, recorder: Recorder, processes: Processes, elapsed_s: float
     ) -> RenderableType:
-        shown = self._table(recorder, processes, elapsed_s)
+        here = [n.removeprefix(ROBOT) for n in processes.names if n.startswith(ROBOT)]
+        (tracks, statuses, _), pids = recorder.latest(), processes.pids
+        others = sorted(tracks.keys() - {*here}, key=lambda name: (name not in self._robots, name))
+        states = {
+            name: robot_state(
+                statuses.get(name),
+                tracks.get(name),
+                is_alive=f"{ROBOT}{name}" in pids,
+                silent_s=self._silent_s(name, tracks[name]) if name in tracks else 0.0,
+                pause_s=1.0,  # it may be drawn late
+                ended_s=math.inf if name in here and f"{ROBOT}{name}" not in pids else None,
+            )
+            for name in [*here, *others]  # guests last
+        }
         lines = [
-            f"{name}: {text}"
-            for name, s in recorder.latest()[1].items()
-            for text in shortcomings(s)
+            Text(f"{name}: {reason}", STYLES[state.severity])
+            for name, state in states.items()
+            if state.word != "waiting" and (state.word != "gone" or name in self._robots)
+            for reason in state.reasons
         ]
-        return Group(shown, *(Text(line, "yellow") for line in lines))
+        return Group(self._table(recorder, processes, elapsed_s, states), *lines)
 
-    def _silent_s(self, name: str, track: Track | None) -> float:
+    def _silent_s(self, name: str, track: Track) -> float:
         """Real seconds since the latest track of a robot came."""
-        stamp_ns, now_s = 0 if track is None else track.stamp_ns, time.monotonic()
-        if self._heard.get(name, (-1, 0.0))[0] != stamp_ns:
-            self._heard[name] = stamp_ns, now_s
+        now_s = time.monotonic()
+        if self._heard.get(name, (-1, 0.0))[0] != track.stamp_ns:
+            self._heard[name] = track.stamp_ns, now_s
         return now_s - self._heard[name][1]
 
-    def _table(self, recorder: Recorder, processes: Processes, elapsed_s: float) -> Table:
+    def _table(
+        self,
+        recorder: Recorder,
+        processes: Processes,
+        elapsed_s: float,
+        states: Mapping[str, RobotState],
+    ) -> Table:
         (tracks, statuses, _), errors_m = recorder.latest(), recorder.latest_errors_m()
         shown = table(
             f"{self._title}, {elapsed_s:.1f} s",
@@ -83,23 +104,14 @@ class LiveTable(LiveView):
         )
         shown.add_column("", overflow="fold")
         pids, restarts = processes.pids, processes.restarts
-        here = [n.removeprefix(ROBOT) for n in processes.names if n.startswith(ROBOT)]
         newest_ns = max((t.stamp_ns for t in tracks.values()), default=0)
-        others = sorted(
-            tracks.keys() - set(here), key=lambda name: (name not in self._robots, name)
-        )
-        for name in [*here, *others]:  # guests last
+        for name, found in states.items():
             process = f"{ROBOT}{name}"
-            pid = str(pids[process]) if process in pids else "down" if name in here else "away"
-            status, track = statuses.get(name), tracks.get(name)
-            silent_s = self._silent_s(name, track)
-            state = _state(track, status, pid, restarts.get(process, 0), silent_s)
-            if status is not None and (text := distrust_text(status.trust)):
-                state.append(f", {text}", "yellow")
-            if status is not None and miscalibration_text(status.counts, status.learned):
-                state.append(", miscalibrated", "yellow")
-            for place in misplaced_objects(status.counts if status is not None else {}):
-                state.append(f", finds {place} elsewhere", "yellow")
+            here = "down" if process in processes.names else "away"
+            pid, status = str(pids.get(process, here)), statuses.get(name)
+            state = Text(found.word, STYLES[found.severity])
+            if restarts.get(process):
+                state.append(f" (restarted {restarts[process]})", "yellow")
             if name not in self._robots:
                 there = newest_ns - tracks[name].stamp_ns <= AWAY_S * 1e9
                 pid, state = "guest", state if there else Text("left", "dim")
@@ -114,24 +126,6 @@ class LiveTable(LiveView):
         if self.width < NARROW:  # without traffic and process, before "ok" is
             del shown.columns[8:12], shown.columns[1]
         return shown
-
-
-def _state(
-    track: Track | None, status: Status | None, pid: str, restarts: int, silent_s: float
-) -> Text:
-    if pid == "down":
-        state = Text("down", style="bold red")
-    elif track is None:
-        state = Text("starting", style="dim")
-    elif silent_s >= SILENT_S:
-        state = Text(f"silent for {silent_s:.0f} s", "bold red")
-    elif track.lost:
-        state = Text(f"lost: {track.lost}", "bold red")
-    elif status is not None and (status.problems or status.unconfirmed):  # said below the table
-        state = Text("problem" if status.problems else "unconfirmed", "yellow")
-    else:
-        state = Text("ok", "green")
-    return state.append(f" (restarted {restarts})", "yellow") if restarts else state
 
 
 def _pose_cells(track: Track | None, error_m: float | None) -> list[Cell]:

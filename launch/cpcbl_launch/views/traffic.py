@@ -13,11 +13,11 @@ from typing import NamedTuple
 
 import msgspec
 
+from cpcbl_agents.robot_state import robot_state
 from cpcbl_launch.reporting.statuses import (
     FlowReport,
     SpendingReport,
     TrustReport,
-    shortcomings,
     summed_flows,
     summed_spending,
     trust_reports,
@@ -123,7 +123,7 @@ def _live_robot(arrivals: Sequence[Arrival], now_s: float) -> LiveRobot:
         heard=tuple(_live_flows(first, last, first.heard, last.heard)),
         spending=summed_spending([last.spending]),
         trust=trust_reports([last]),
-        problems=shortcomings(last),
+        problems=robot_state(last).shortcomings,
     )
 
 

@@ -11,7 +11,6 @@ from cpcbl_launch.reporting.statuses import (
     FlowReport,
     SpendingReport,
     are_limits_kept,
-    distrust_text,
 )
 from cpcbl_launch.reporting.tables import number, short, table
 from cpcbl_launch.views.live import LiveView
@@ -159,10 +158,7 @@ def _activity(robot: LiveRobot, given: Sequence[HelpLink]) -> Text:
         return Text(f"away: silent for {robot.silent_s:.0f} s", "yellow")
     if robot.lost:
         return Text(f"lost: {robot.lost}", "bold red")
-    lines = list(_arrows(given)) if given else [Text("nobody", "dim")]
-    if text := distrust_text(robot.trust):
-        lines.append(Text(text, "yellow"))
-    return Text("\n").join(lines)
+    return Text("\n").join(_arrows(given)) if given else Text("nobody", "dim")
 
 
 def _arrows(given: Sequence[HelpLink]) -> Iterator[Text]:

@@ -6,10 +6,10 @@ from collections.abc import Sequence
 import pytest
 from rich.console import Console
 
+from cpcbl_agents.robot_state import distrust_text
 from cpcbl_launch.reporting.recorder import Recorder, Report
 from cpcbl_launch.reporting.statuses import (
     TrustReport,
-    distrust_text,
     trust_remarks,
     trust_reports,
 )

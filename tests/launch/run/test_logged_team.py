@@ -12,11 +12,11 @@ import pytest
 from rich.console import Console
 from support.logs import EPOCH_MS, LANDMARKS, STARTS, STEP_MS, log_team, write_log
 
+from cpcbl_agents.robot_state import miscalibration_text
 from cpcbl_agents.sources.mrclam import LogError
 from cpcbl_launch.lab.evaluation import evaluate_log
 from cpcbl_launch.lab.experiments import budget
 from cpcbl_launch.reporting.recorder import LearnedReport, Report
-from cpcbl_launch.reporting.statuses import miscalibration_text
 from cpcbl_launch.run.logged_team import (
     LoggedTeam,
     builtin_for,

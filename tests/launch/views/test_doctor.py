@@ -276,7 +276,7 @@ def test_the_status_of_a_robot_has_its_problems() -> None:
     r1, r2, r3 = robot_statuses(heard, TEAM)
     assert r1.problems == ("2 processes have this name",)
     assert (r1.processes, r1.tier, r1.inputs[0].published_hz) == (2, 1, 10.0)
-    assert r2.problems == r3.problems == ("alive, but sends no status",)
+    assert r2.problems == r3.problems == ("waiting: its process runs, but has sent nothing yet",)
     assert r2.status_offset_s is None
 
 

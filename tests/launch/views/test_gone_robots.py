@@ -48,7 +48,7 @@ def test_a_robot_that_ended_is_gone(end: str) -> None:
     assert heard.robots == []
     r1, r2 = robot_statuses(heard, TEAM)
     assert (r1.state, r1.problems) == ("gone", ("gone: its process or its link ended",))
-    assert (r2.state, r2.problems) == ("waiting", ("sends no status",))
+    assert (r2.state, r2.problems) == ("waiting", ("waiting: nothing was heard",))
     answers = (EndpointFacts(endpoint="tcp/127.0.0.1:7447", answer="open"),)
     facts = Facts(
         now=datetime(2026, 11, 1, tzinfo=UTC),

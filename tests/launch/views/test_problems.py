@@ -12,7 +12,7 @@ from support.buses import SECOND
 from support.traffic import recorded, seen, shown, status
 
 from cpcbl_launch.reporting.recorder import Recorder
-from cpcbl_launch.views.run import SILENT_S, LiveTable
+from cpcbl_launch.views.run import LiveTable
 from cpcbl_launch.views.traffic import traffic_from_statuses
 from cpcbl_launch.views.traffic_tables import traffic_view
 from cpcbl_transport import topics
@@ -97,10 +97,11 @@ def test_a_robot_that_is_silent_is_not_ok_in_the_live_table(
     monkeypatch.setattr(time, "monotonic", lambda: now_s)
     table.tracks(SECOND, "r1", "r2")
     assert table.rows()["r1"].endswith("ok")
-    now_s += SILENT_S + 1.0
+    now_s += 4.0
     table.tracks(5 * SECOND, "r2")
     rows = table.rows()
-    assert rows["r1"].endswith("silent for 4 s")
+    assert rows["r1"].endswith("gone")
+    assert rows["r1:"] == "r1: gone: silent for 4 s"
     assert rows["r2"].endswith("ok")
 
 

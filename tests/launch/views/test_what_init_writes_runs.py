@@ -20,8 +20,8 @@ LISTEN = ("--duration", 1.5)
 
 @pytest.fixture(scope="module")
 def team(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """The team file that `init` wrote, of two robots, of which r1 runs with its driver; a driver
-    of another team is on the same router."""
+    """The team file that `init` wrote, of two robots, of which r1 knows its pose by its driver; a
+    driver of another team is on the same router."""
     folder, endpoint = tmp_path_factory.mktemp("lab"), free_endpoint()
     words = ("--yes", "--robots", "r1,r2", "--router", endpoint)
     assert command_line("init", folder, *words).returncode == 0
@@ -36,6 +36,7 @@ def team(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     with open_router("nobody", [endpoint]):
         processes = [subprocess.Popen(c, stderr=subprocess.DEVNULL) for c in commands]
         try:
+            assert eventually(lambda: r1_status(file)["tier"] in (0, 1, 2), within_s=40.0)
             yield file
         finally:
             for process in processes:
@@ -48,14 +49,15 @@ def report(*words: object) -> object:
     return json.loads(command_line(*words, "--json").stdout)
 
 
-def test_the_driver_feeds_its_robot(team: Path) -> None:
-    def r1() -> dict[str, object]:
-        own = report("status", team, "r1", *LISTEN)
-        assert isinstance(own, list)
-        return dict(own[0])
+def r1_status(team: Path) -> dict[str, object]:
+    """What `status` says of r1."""
+    own = report("status", team, "r1", *LISTEN)
+    assert isinstance(own, list)
+    return dict(own[0])
 
-    assert eventually(lambda: r1()["tier"] in (0, 1, 2), within_s=40.0)
-    inputs = r1()["inputs"]
+
+def test_the_driver_feeds_its_robot(team: Path) -> None:
+    inputs = r1_status(team)["inputs"]
     assert isinstance(inputs, list)
     assert [own["input"] for own in inputs] == ["odometry", "sightings"]
     assert all(own["published_hz"] > 0.0 for own in inputs)

@@ -2,11 +2,13 @@
 
 from collections.abc import Iterable, Sequence
 
+from cpcbl_agents.robot_state import robot_state
 from cpcbl_launch.run.ros2.planar import Fields, header_fields
 from cpcbl_transport.messages import Status
 
 OK, WARN, ERROR, STALE = 0, 1, 2, 3
-SILENT_S = 3.0
+LEVELS = {"good": OK, "warning": WARN, "error": ERROR}
+STATUS_S = 1.0  # between two statuses of a robot
 MOST_LINES = 20  # of one status
 LONGEST = 200  # characters of a line
 
@@ -19,15 +21,12 @@ def diagnostics_message(statuses: Iterable[Fields], stamp_ns: int) -> Fields:
 def robot_diagnostic(robot: str, status: Status | None, age_s: float) -> Fields:
     """The diagnostic of one robot, by its latest status, which came `age_s` ago: stale without
     one, an error while it is lost, a warning for whatever else is wrong."""
-    if status is None or age_s > SILENT_S:
+    state = robot_state(status, silent_s=age_s, pause_s=STATUS_S)
+    if status is None or state.word == "gone":
         text = f"no status for {age_s:.0f} s: does cpcbl-team robot run?"
         return _diagnostic(robot, STALE, text if status is not None else "no status yet", ())
     quarantined = [f"{t.peer} ({t.reason})" for t in status.trust if t.reason]
-    warnings = [*status.problems]
-    warnings += [status.unconfirmed] if status.unconfirmed else []
-    warnings += [f"teammate in quarantine: {name}" for name in quarantined]
-    level = ERROR if status.lost else WARN if warnings else OK
-    message = f"lost: {status.lost}" if status.lost else warnings[0] if warnings else "localized"
+    message = next(iter(state.reasons), "localized")
     values: list[tuple[str, object]] = [
         ("position sigma m", f"{status.position_sigma_m:.3f}"),
         ("heading sigma rad", f"{status.heading_sigma_rad:.3f}"),
@@ -36,12 +35,12 @@ def robot_diagnostic(robot: str, status: Status | None, age_s: float) -> Fields:
         ("unconfirmed", status.unconfirmed),
         ("quarantine", ", ".join(quarantined)),
     ]
-    values += [(f"problem {i}", text) for i, text in enumerate(status.problems)]
+    values += [(f"problem {i}", text) for i, text in enumerate(state.problems)]
     for health in status.inputs:
         values.append((f"{health.input} rate hz", f"{health.rate_hz:.1f}"))
         refused = ", ".join(f"{count} x {reason}" for reason, count in health.refused.items())
         values.append((f"{health.input} refused", refused))
-    return _diagnostic(robot, level, message, values)
+    return _diagnostic(robot, LEVELS[state.severity], message, values)
 
 
 def bridge_diagnostic(robot: str, findings: Sequence[str]) -> Fields:

@@ -1,33 +1,26 @@
 """What the page draws, as plain data: pure functions of what was received, and of the time."""
 
 import math
-from collections.abc import Collection, Iterator, Mapping
-from typing import Any, Literal
+from collections.abc import Collection, Mapping
+from typing import Any
 
 import msgspec
 
+from cpcbl_agents.robot_state import RobotState, Severity, Word, robot_state
 from cpcbl_launch.reporting.metrics import degrees
-from cpcbl_launch.reporting.statuses import (
-    SpendingReport,
-    TrustReport,
-    distrust_text,
-    miscalibration_text,
-)
+from cpcbl_launch.reporting.statuses import SpendingReport, TrustReport
 from cpcbl_launch.views.traffic import LiveFlow, Traffic
 from cpcbl_launch.views.web.feed import LatestMessages, Snapshot, position_sigma_m
 from cpcbl_team.config import Field, Team
 from cpcbl_team.inputs import Sighting, SightingFault
 from cpcbl_transport.messages import Refusal, Truth
 
-SILENT_S = 2.0  # so long, and three of its pauses, a robot is silent before it is marked
-TOKEN_LOST_S = 0.5  # a robot that changes its tier may have no token for a moment
 SEEN_S = 1.0  # sightings older than this are not drawn
 MOST_SEEN, LONGEST_TEXT = 50, 200
 LEFT_S = 30.0  # a guest that left is shown for so long
 UNHEARD_S = 3.0  # so long after the connection the team should have been heard
 REFUSALS = frozenset([*Refusal, *SightingFault])
 
-State = Literal["ok", "unconfirmed", "problem", "lost", "gone", "waiting"]
 Triple = tuple[float, float, float]
 Arrow = tuple[str, str, str, int, float | None]
 """Helper, helped, topic, tier of the helper, messages/s."""
@@ -37,8 +30,9 @@ class RobotPicture(msgspec.Struct, frozen=True, omit_defaults=True):
     """One robot as it is drawn. Metres and radians in the frame of the field; times are seconds
     since the start of the view."""
 
-    state: State
+    state: Word
     why: str = ""  # in words, unless the state is ok
+    severity: Severity = "good"
     is_guest: bool = False
     at_s: float | None = None  # when its latest pose arrived
     pose: Triple | None = None  # x, y, heading
@@ -153,7 +147,8 @@ def _picture(
     began_s: float,
 ) -> RobotPicture | None:
     """None for a guest that left."""
-    state, why = state_of(latest, now_s)
+    found = state_of(latest, now_s)
+    state = found.word
     since_s = now_s - max(latest.latest_s, latest.token_lost_s or 0.0)
     if is_guest and state in ("gone", "waiting") and since_s > LEFT_S:
         return None
@@ -163,7 +158,8 @@ def _picture(
     there = None if truth is None else (truth.x_m, truth.y_m, truth.heading_rad)
     common = RobotPicture(
         state=state,
-        why=why[:LONGEST_TEXT],
+        severity=found.severity,
+        why=found.why[:LONGEST_TEXT],
         is_guest=is_guest,
         sigma_m=None if status is None else _round(status.position_sigma_m, 4),
         tier=None if status is None else status.tier,
@@ -184,35 +180,17 @@ def _picture(
     )
 
 
-def state_of(latest: LatestMessages, now_s: float) -> tuple[State, str]:
-    """Whether all is well with a robot, and why not: the worst that is known, in words."""
-    if not latest.is_present:
-        return "waiting", "nothing was received from it yet"
-    silent_s = now_s - latest.latest_s
-    if latest.token_lost_s is not None and now_s - latest.token_lost_s > TOKEN_LOST_S:
-        return "gone", f"its process or its link ended {now_s - latest.token_lost_s:.0f} s ago"
-    if latest.latest_s and silent_s > max(SILENT_S, 3.0 * latest.pause_s):
-        return "gone", f"silent for {silent_s:.0f} s"
-    track, status = latest.track, latest.status
-    newest = status if track is None or (status and status.stamp_ns > track.stamp_ns) else track
-    if newest is None:
-        return "waiting", "its process runs, but has sent no pose yet"
-    if newest.lost:
-        return "lost", "; ".join([newest.lost, *getattr(status, "problems", ())[:1]])
-    problems = list(_problems(latest))
-    if problems:
-        return "problem", problems[0]
-    unconfirmed = status.unconfirmed if status else ""
-    return ("unconfirmed", unconfirmed) if unconfirmed else ("ok", "")
-
-
-def _problems(latest: LatestMessages) -> Iterator[str]:
-    if (status := latest.status) is not None:
-        yield from getattr(status, "problems", ())
-        if text := distrust_text(status.trust):
-            yield text
-        if miscalibration_text(status.counts, status.learned):
-            yield "its sensors or its odometry are miscalibrated"
+def state_of(latest: LatestMessages, now_s: float) -> RobotState:
+    """The state of a robot by what was received of it."""
+    lost_s = latest.token_lost_s
+    return robot_state(
+        latest.status,
+        latest.track,
+        is_alive=bool(latest.tokens),
+        silent_s=now_s - latest.latest_s if latest.latest_s else 0.0,
+        pause_s=latest.pause_s,
+        ended_s=None if lost_s is None else now_s - lost_s,
+    )
 
 
 def ellipse_of(xx: float, xy: float, yy: float) -> Triple:
@@ -273,7 +251,7 @@ def robot_detail(name: str, latest: LatestMessages, traffic: Traffic) -> RobotDe
         robot=name,
         process=status.incarnation,
         heading_sigma_deg=_round(degrees(status.heading_sigma_rad), 2),
-        problems=tuple(_problems(latest)),
+        problems=robot_state(status).problems,
         inputs=inputs,
         refused={reason: n for reason, n in status.counts.items() if reason in REFUSALS and n},
         counts={what: n for what, n in status.counts.items() if what not in REFUSALS},

@@ -91,7 +91,7 @@ def test_the_pose_as_odometry() -> None:
         ({"lost": "position sigma 3 m"}, ERROR, "lost: position sigma 3 m"),
         ({"problems": ("no odometry",)}, WARN, "no odometry"),
         ({"unconfirmed": "found without a start"}, WARN, "found without a start"),
-        ({"trust": (Trust("r2", "bias"),)}, WARN, "teammate in quarantine: r2 (bias)"),
+        ({"trust": (Trust("r2", "bias"),)}, WARN, "distrusts r2 (bias)"),
     ],
 )
 def test_a_diagnostic_says_what_is_wrong(

@@ -26,7 +26,7 @@ from cpcbl_launch.views.web.page_data import (
 )
 from cpcbl_team.config import Field, Landmark, RobotSettings, SensorSettings, Team
 from cpcbl_team.inputs import Sighting, Sightings
-from cpcbl_transport.messages import Spending, Track, Trust, Truth
+from cpcbl_transport.messages import Spending, Track, Truth
 
 COVARIANCE = (0.04, 0.0, 0.01, 0.0, 0.0, 0.01)
 
@@ -54,45 +54,36 @@ def picture(robot: LatestMessages, now_s: float = 10.1, **truths: Truth) -> Robo
 @pytest.mark.parametrize(
     ("robot", "now_s", "state", "why"),
     [
-        (LatestMessages(), 10.0, "waiting", "nothing was received"),
-        (LatestMessages(tokens=frozenset("t")), 10.0, "waiting", "no pose yet"),
+        (LatestMessages(), 10.0, "waiting", "nothing was heard"),
+        (LatestMessages(tokens=frozenset("t")), 10.0, "waiting", "its process runs"),
         (latest(), 10.1, "ok", ""),
         (latest(track=track(lost="position sigma 0.7 m")), 10.1, "lost", "position sigma 0.7 m"),
         (latest(), 12.1, "gone", "silent for 2 s"),
         (latest(pause_s=2.0), 15.9, "ok", ""),  # one whose time runs slowly
-        (latest(token_lost_s=10.0), 10.4, "ok", ""),  # it changes its tier
         (latest(token_lost_s=10.0), 10.6, "gone", "its process or its link ended 1 s ago"),
+        (
+            latest(arrivals=seen(status("r1", 10.0, 3, unconfirmed="it stood"))),
+            10.1,
+            "unconfirmed",
+            "it stood",
+        ),
     ],
 )
-def test_the_state_of_a_robot_is_the_worst_that_is_known(
+def test_the_state_of_a_robot_is_that_of_what_was_received(
     robot: LatestMessages, now_s: float, state: str, why: str
 ) -> None:
-    found, told = state_of(robot, now_s)
-    assert found == state
-    assert why in told
-    assert bool(told) is (state != "ok")
+    found = picture(robot, now_s)
+    assert found.state == state
+    assert why in found.why
+    assert (found.severity == "good") is (state == "ok")
 
 
 def test_a_killed_robot_is_marked_within_three_seconds_however_it_ends() -> None:
     last_s = 10.0
-    assert state_of(latest(token_lost_s=last_s), last_s + 3.0)[0] == "gone"  # its link was closed
+    assert state_of(latest(token_lost_s=last_s), last_s + 3.0).word == "gone"  # its link was closed
     cut = latest(token_lost_s=last_s + 2.0)  # nobody closed it: the lease of 2 s
-    assert state_of(cut, last_s + 3.0)[0] == "gone"
-    assert state_of(latest(), last_s + 3.0)[0] == "gone"  # it hangs, but its token stays
-
-
-def test_a_problem_that_a_robot_tells_is_shown_before_what_is_inferred() -> None:
-    distrust = (Trust("west", "biased"),)
-    robot = latest(arrivals=seen(status("r1", 10.0, 3, trust=distrust)))
-    assert state_of(robot, 10.1) == ("problem", "distrusts west (biased)")
-
-
-def test_a_pose_that_nothing_confirms_is_not_ok() -> None:
-    unconfirmed = "the heading is not confirmed: the robot has not driven so far"
-    robot = latest(arrivals=seen(status("r1", 10.0, 3, unconfirmed=unconfirmed)))
-    assert state_of(robot, 10.1) == ("unconfirmed", unconfirmed)
-    both = status("r1", 10.0, 3, unconfirmed=unconfirmed, problems=("bearings look mirrored",))
-    assert state_of(latest(arrivals=seen(both)), 10.1)[0] == "problem"
+    assert state_of(cut, last_s + 3.0).word == "gone"
+    assert state_of(latest(), last_s + 3.0).word == "gone"  # it hangs, but its token stays
 
 
 def test_a_picture_has_the_ellipse_the_error_and_what_is_seen() -> None:

@@ -71,7 +71,7 @@ function robot(name) {
 }
 
 // What the server leaves out has its default.
-const DEFAULTS = { why: "", is_guest: false, at_s: null, pose: null, ellipse: null, sigma_m: null, error_m: null, tier: null, truth: null, sees: [] };
+const DEFAULTS = { severity: "good", why: "", is_guest: false, at_s: null, pose: null, ellipse: null, sigma_m: null, error_m: null, tier: null, truth: null, sees: [] };
 
 function frame(message) {
   say({ ack: message.number });
@@ -148,7 +148,7 @@ function summary() {
   if (count.waiting) words.push(`${count.waiting} waiting`);
   if (total && count.ok === total) words.push("all well");
   setText($("summary"), words.join(", "));
-  $("summary").classList.toggle("bad", count.lost + count.gone > 0);
+  $("summary").classList.toggle("bad", [...robots.values()].some((r) => r.severity === "error"));
 }
 
 function setText(element, text) {

@@ -1,6 +1,5 @@
 // The table of all robots, which also serves screen readers, and all of the chosen one.
 const $ = (id) => document.getElementById(id);
-const WORDS = { ok: "ok", unconfirmed: "unconfirmed", problem: "problem", lost: "lost", gone: "gone", waiting: "waiting" };
 const number = (value, digits = 3) => (value == null ? "–" : value.toFixed(digits));
 const plural = (n, what) => `${n} ${what}${n === 1 ? "" : "s"}`;
 const words = (name) => name.replaceAll("_", " ");
@@ -36,7 +35,7 @@ export class Panel {
     button.setAttribute("aria-pressed", r.name === this.team.chosen);
     button.style.setProperty("--own", r.colour);
     set(button, r.is_guest ? `${r.name} (guest)` : r.name);
-    set(cells[0], WORDS[state]);
+    set(cells[0], state);
     cells[0].className = `s-${state}`;
     reason.hidden = state === "ok" || !r.why;
     set(reason.firstChild, r.why ?? "");
@@ -106,7 +105,7 @@ export class Panel {
     if (d.robot !== this.team.chosen) return;
     if (!d.process) return;
     const r = this.robots.get(d.robot), parts = [];
-    if (r?.why && !d.problems.includes(r.why)) parts.push(paragraph(`${WORDS[r.state]}: ${r.why}`, `s-${r.state}`));
+    if (r?.why && !d.problems.includes(r.why)) parts.push(paragraph(`${r.state}: ${r.why}`, `s-${r.state}`));
     if (d.problems.length) parts.push(heading("Problems"), list(d.problems));
     const place = r?.pose ? `x ${number(r.pose[0], 2)} m, y ${number(r.pose[1], 2)} m, heading ${((r.pose[2] * 180) / Math.PI).toFixed(0)}°` : "no pose";
     parts.push(heading("Pose"), paragraph(`${place}; heading σ ${number(d.heading_sigma_deg, 1)}°; sees ${r?.sees.map((s) => s[0]).join(", ") || "nothing"}`));
