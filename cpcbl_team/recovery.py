@@ -13,6 +13,7 @@ from cpcbl_team.config import Field, LocalizationSettings, LocalizerSettings
 from cpcbl_team.estimate import Covariance3, Estimate
 from cpcbl_team.landmarks import Landmarks
 from cpcbl_team.map_rejections import MapRejections
+from cpcbl_team.map_residuals import NO_RESIDUALS
 from cpcbl_team.miscalibration import (
     AS_CONFIGURED,
     Adaptation,
@@ -302,6 +303,7 @@ class Recovery:
                 references=None,
                 check=calibration.check.restarted(state.updates.accepted),
                 rejections=MapRejections(stamp_ns=state.stamp_ns, counted=state.updates.accepted),
+                residuals=NO_RESIDUALS,
                 common=None if common is None else common.uncorrelated(),
             ),
         )
