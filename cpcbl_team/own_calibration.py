@@ -4,6 +4,7 @@ A robot that calibrates itself (`self_calibration.py`) learns scales and a bias 
 other one changes its settings only where they are wrong (`miscalibration.py`).
 """
 
+import math
 from collections.abc import Iterable, Sequence
 
 from cpcbl_team.config import Field, LocalizationSettings, OdometryNoise
@@ -11,10 +12,12 @@ from cpcbl_team.constant_errors import NO_ERRORS, NO_EVIDENCE, pose_offset
 from cpcbl_team.estimate import POSE, offset_pose
 from cpcbl_team.geometry import new
 from cpcbl_team.landmarks import Landmarks, LandmarkUpdate
+from cpcbl_team.map_residuals import Reading
 from cpcbl_team.measurements import GatedObject
 from cpcbl_team.miscalibration import (
     AS_CONFIGURED,
     BLOCK_NS,
+    LEAST_DISTANCE_M,
     LEAST_PARTS,
     STEP_NS,
     Adaptation,
@@ -47,6 +50,7 @@ class OwnCalibration:
         )
         # Of two that contradict each other either one may be wrong
         self._names_misplaced = len(field.landmarks) + len(field.walls) > 2
+        self._names_of_landmarks = frozenset(field.landmarks)
         block_s = BLOCK_NS * 1e-9
         correlation_s, spacing_s = settings.sensor.correlation_s, SPACING_NS * 1e-9
         self._rules = Rules(
@@ -112,7 +116,7 @@ class OwnCalibration:
         check = memory.check
         begin, ahead = check.begin, check.ahead
         if begin is None or ahead is None or now_ns - begin.stamp_ns >= BLOCK_NS:
-            return self._after_check(self._with_ranges(state))
+            return self._after_check(self._with_ranges(self._with_residuals(state)))
         if now_ns - ahead.stamp_ns >= STEP_NS:
             noise = noise_with_factor(self._noise, memory.adaptation.motion_factor)
             check = check.with_step(now_ns, state.odometry_from_robot, noise)
@@ -124,6 +128,29 @@ class OwnCalibration:
         memory, check = state.memory.calibration, ModelCheck(accepted=state.updates.accepted)
         known = CalibrationMemory(memory.learned, memory.references, memory.total_turn_rad, check)
         return _with_calibration(state, known._replace(common=memory.common))
+
+    def _with_residuals(self, state: State) -> State:
+        """The state that has compared what it read of landmarks with the map, once a block in which
+        it has moved: from one place any of them may be the wrong one."""
+        memory, recovery, place = state.memory.calibration, state.memory.recovery, state[2]
+        begin = memory.check.begin
+        if not self._names_misplaced or begin is None or recovery.lost:
+            return state
+        moved = place.x - begin.odometry_from_robot.x, place.y - begin.odometry_from_robot.y
+        if math.hypot(*moved) < LEAST_DISTANCE_M:
+            return state
+        field_from_odometry = state.estimate.pose @ place.inverse()
+        pieces = [e for e in recovery.evidence if not e.from_teammate]
+        for snapshot in recovery.snapshots:
+            if snapshot[0] > begin.stamp_ns:
+                pieces += self._landmarks.evidence_of(snapshot, memory.adaptation)
+        readings, k = [], 1.0 / math.sqrt(self._independent_frames)
+        for e in pieces:
+            if e.stamp_ns > begin.stamp_ns and e.source in self._names_of_landmarks:
+                x, y, heading = field_from_odometry @ e.odometry_from_robot
+                seen = e.range_m, e.bearing_rad, k * e.range_sigma_m, k * e.bearing_sigma_rad
+                readings.append(Reading(e.source, e.x - x, e.y - y, heading, *seen))
+        return _with_calibration(state, memory._replace(residuals=memory.residuals.plus(readings)))
 
     def _with_ranges(self, state: State) -> State:
         """The state that has compared distances between landmarks with the map, once a block."""
@@ -216,8 +243,8 @@ class OwnCalibration:
 
     def _with_check(self, state: State, check: ModelCheck, present: Adaptation) -> State:
         memory = state.memory.calibration
-        learned, references, total_turn_rad, _, _, rejections, ranges, common = memory
-        parts = learned, references, total_turn_rad, check, present, rejections, ranges, common
+        learned, references, total_turn_rad, _, _, *others = memory
+        parts = learned, references, total_turn_rad, check, present, *others
         return _with_calibration(state, new(CalibrationMemory, parts))
 
 

@@ -17,6 +17,7 @@ from cpcbl_team.estimate import HEADING, POSE, POSITION, Covariance3, Estimate, 
 from cpcbl_team.geometry import Pose2, new, wrap_angle
 from cpcbl_team.inputs import Belief, Odometry, Sighting
 from cpcbl_team.map_rejections import MapRejections
+from cpcbl_team.map_residuals import MapResiduals
 from cpcbl_team.miscalibration import (
     AS_CONFIGURED,
     Adaptation,
@@ -164,6 +165,7 @@ class CalibrationMemory(NamedTuple):
     common: CommonErrors | None = None
     """What is known of the constant errors of the camera; None without a camera whose errors the
     filter considers."""
+    residuals: MapResiduals = MapResiduals()
 
     @property
     def corrected(self) -> SelfCalibration:
@@ -174,6 +176,10 @@ class CalibrationMemory(NamedTuple):
             turn_scale=self.learned.turn_scale * adapted.turn_scale,
             bearing_bias_rad=self.bearing_bias_rad,
         )
+
+    def misplaced(self, stamp_ns: int) -> str:
+        """The object that must stand elsewhere than on the map; empty if there is none."""
+        return self.rejections.misplaced(stamp_ns) or self.residuals.misplaced()
 
     @property
     def bearing_bias_rad(self) -> float:

@@ -74,7 +74,7 @@ class FilterAgent:
         state = self.timeline.state
         calibration = state.memory.calibration
         factors = percentages(calibration.adaptation)
-        if name := calibration.rejections.misplaced(state.stamp_ns):
+        if name := calibration.misplaced(state.stamp_ns):
             factors[MISPLACED + name] = 1
         return self.counts + Counter(self.timeline.state.counts) + Counter(factors)
 
