@@ -29,6 +29,11 @@ def ros2_problems(team: Team) -> Iterator[str]:
         if robot.ros2.navsat and ros2.datum is None:
             fix = "add ros2.datum with latitude_deg and longitude_deg"
             yield f"{key}.navsat: where is the field on the earth? {fix}"
+        if robot.ros2.map_frame and not robot.ros2.tf_static:
+            fix = "name its topic in tf_static, which says where it is"
+            yield f"{key}.map_frame: nothing connects it with {ros2.field_frame!r}; {fix}"
+        if robot.ros2.odometry_frame in (robot.ros2.map_frame, ros2.field_frame):
+            yield f"{key}.odometry_frame: is the field's frame too; give it its own"
         for image in NEED_CAMERA:
             if getattr(robot.ros2, image) and robot.sensing != "camera":
                 fix = 'set sensing = "camera", so that this software looks for objects in them'

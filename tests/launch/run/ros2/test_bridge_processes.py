@@ -304,6 +304,11 @@ def plain_router(folder: Path, endpoint: str) -> Path:
     [
         (("connect", "connec"), "ros2.connec: unknown key; did you mean 'connect'?"),
         (('["{ros}"]', '["rmw:7447"]'), "ros2.connect: 'rmw:7447': no endpoint"),
+        (
+            ("[robots.r1]", '[robots.r1]\nros2 = {{ map_frame = "m", tf_static = "" }}'),
+            "map_frame: no",
+        ),
+        (("[robots.r1]", '[robots.r1]\nros2 = {{ odometry_frame = "map" }}'), "odometry_frame: is"),
         (('["{ros}"]', '["tls/a:1"]'), "ros2.connect: 'tls/a:1': needs certificates"),
     ],
 )
