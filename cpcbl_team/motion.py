@@ -163,9 +163,9 @@ def inflate_by_gap(
     estimate: Estimate, gap_ns: int, before: Odometry | None, gap_speed_m_s: float
 ) -> Estimate:
     """The estimate after a long time without odometry: a random walk. In one second it leads as far
-    as `gap_speed_m_s` and the last speed do, each for a second."""
-    speed, rate = (0.0, 0.0) if before is None else _speeds(before)
-    seconds, least = gap_ns * 1e-9, gap_speed_m_s * gap_speed_m_s
-    p, h = (least + speed * speed) * seconds, (least + rate * rate) * seconds
-    growth = Covariance3(p, 0.0, p, 0.0, 0.0, h)
-    return estimate._replace(covariance=estimate.covariance.plus(growth))
+    as `gap_speed_m_s` and the last speed do, each for a second; a robot that drove may turn since
+    then, and one that turned may drive, so the larger of both speeds (m/s, rad/s) counts."""
+    fastest = 0.0 if before is None else max(map(abs, _speeds(before)))
+    growth = (gap_speed_m_s**2 + fastest**2) * gap_ns * 1e-9
+    added = Covariance3(growth, 0.0, growth, 0.0, 0.0, growth)
+    return estimate._replace(covariance=estimate.covariance.plus(added))
