@@ -2,7 +2,8 @@
 
 The robot sends what gives the most information for its bytes: a fix to a worse localized teammate
 that it sees, and a belief when its subscribers can no longer predict its pose from the last one. It
-never encodes a message that gives too little or exceeds the budget. A lost robot sends neither.
+never encodes a message that gives too little or exceeds the budget. A lost robot sends neither, nor
+does one whose pose may be wrong.
 """
 
 import math
@@ -130,6 +131,7 @@ class CollaborationAgent:
         self._never_ns = self._from_ns - int(gains.UNKNOWN_AGE_S * 1e9)  # in place of a last help
         self._belief_sent_ns = self._never_ns
         self._has_subscribers = False
+        self.may_mislead = False  # what its pose is not confirmed for would mislead teammates
         self.counters = MessageCounters()
         self.tier = LOWEST_TIER
         self.latest: agent.PoseEstimate | None = None
@@ -244,7 +246,7 @@ class CollaborationAgent:
                 continue
             fix = with_sensor_factor(fix, seen.sensor_factor)
             self._latest_fixes[fix.robot] = fix
-            if seen.lost:
+            if seen.lost or self.may_mislead:
                 continue
             if fix.robot in self._tiers:
                 self._early_fixes.pop(fix.robot, None)
@@ -330,7 +332,7 @@ class CollaborationAgent:
         rules, tally = self._rules, self.counters.of("belief", "")
         due = now.stamp_ns >= self._belief_ns + int(1e9 / rules.belief_rate_hz)
         is_wanted = self.has_started and rules.passive and self._has_subscribers
-        if not due or not is_wanted or now.lost:
+        if not due or not is_wanted or now.lost or self.may_mislead:
             return []
         self._belief_ns = now.stamp_ns
         (pose, covariance, _), rates = now.estimate, (now.speed_m_s, now.turn_rate_rad_s)

@@ -117,7 +117,7 @@ class Node:
         self.received = MessageCounters()
         self._clocks = ClockMonitor(rules.trust, speed) if rules.trust.enabled else None
         self._health = InputMonitor(robot.name, team, start_ns, speed)
-        self._pose.unconfirmed = self._health.unconfirmed
+        self._note_confirmation()
         self._namesakes: set[str] = set()  # tokens of other processes with this robot's name
         self._inputs = [
             bus.subscribe(topic.at(robot=robot.name), self._on_message) for topic in topics.INPUTS
@@ -300,7 +300,7 @@ class Node:
             self.robot.forget_wrong_inputs(now_ns)
         overload = self._load.judge(len(self._inbox), self._inbox.pop_dropped())
         problems = (*overload, *problems, *self.robot.sensing.problems)
-        self._pose.unconfirmed = self._health.unconfirmed
+        self._note_confirmation()
         status = msgspec.structs.replace(
             status,
             inputs=inputs,
@@ -313,6 +313,11 @@ class Node:
         as_json = self._declarations.publisher(topics.STATUS, key)
         if as_json.matching:
             as_json.put(encode_json(status))
+
+    def _note_confirmation(self) -> None:
+        """Passes on what is not confirmed about the pose."""
+        self._pose.unconfirmed = self._health.unconfirmed
+        self.robot.collaboration.may_mislead = self._health.may_mislead
 
 
 class GuestNode(Node):

@@ -43,6 +43,7 @@ class InputSnapshot(NamedTuple):
     mistake: str = ""  # of the driver, that explains why the robot is lost
     jump: Jump | None = None  # the latest
     rejected: tuple[int, int] = (0, 0)  # of the latest innovations, and how many these are
+    accepted: int = 0  # measurements since the start
     suspected_ns: int = -1  # since when it rejects more than it should; -1: it does not
     initial_pose: InitialPose | None = None  # the newest that somebody has set
 
@@ -123,6 +124,7 @@ class Robot:
             mistake=recovery.mistake,
             jump=recovery.jump,
             rejected=rejected_of(state.updates.innovations),
+            accepted=state.counts.get("accepted", 0),
             suspected_ns=recovery.suspected_ns,
             initial_pose=self.filter.initial_pose,
         )

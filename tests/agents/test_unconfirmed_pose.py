@@ -3,10 +3,13 @@
 import math
 
 import pytest
+from support.buses import SECOND
+from support.collaboration import POOR, Alone, ahead
 from support.drivers import DrivenRobot, World
 from support.mistake_rows import ODOMETRY, SEEN
 from support.mistakes import bearings
 
+from cpcbl_agents.agent import BeliefSubscribers, Presence
 from cpcbl_team.config import OdometrySettings, Start
 from cpcbl_team.geometry import Pose2, wrap_angle
 from cpcbl_team.inputs import InitialPose
@@ -103,6 +106,32 @@ def test_a_robot_that_never_moves_is_confirmed_by_the_order_of_three_landmarks(
     assert bool(said) is bool(robot.statuses[-1].unconfirmed)
 
 
+@pytest.mark.parametrize(("places", "helps"), [(THREE, True), (TWO, False)])
+def test_a_robot_helps_teammates_unless_its_pose_may_be_mirrored(
+    places: dict[str, tuple[float, float]], helps: bool
+) -> None:
+    """Three landmarks in one frame have an order. Bearings that are off by an angle turn the robot
+    the other way, so that teammates are where it says."""
+    robot = DrivenRobot(STAND._replace(places=places))
+    assert robot.node.robot.collaboration.may_mislead
+    robot.run(4.1)
+    assert "is not confirmed" in robot.statuses[-1].unconfirmed
+    assert robot.node.robot.collaboration.may_mislead is not helps
+
+
+def test_a_robot_whose_pose_may_be_wrong_helps_nobody() -> None:
+    alone = Alone()
+    alone.tell(Presence("mate", POOR), BeliefSubscribers(True))
+    assert len(alone.sees(ahead())) == 1
+    assert len(alone.later(2.0)) > 0
+    alone.agent.may_mislead = True
+    assert alone.sees(ahead(), after_ns=10 * SECOND) == []
+    assert alone.later(2.0) == []
+    alone.agent.may_mislead = False
+    assert len(alone.sees(ahead(), after_ns=10 * SECOND)) == 1
+    assert len(alone.later(2.0)) > 0
+
+
 def test_after_a_mistake_only_what_came_since_confirms() -> None:
     robot = DrivenRobot(ARC)
     robot.run(6.1, SEEN["from the camera's x"].make())
@@ -144,6 +173,7 @@ def test_many_rejected_measurements_are_said_before_the_robot_is_lost() -> None:
     robot.run(6.0, ODOMETRY["headings in degrees"].make())
     said = [s for s in robot.statuses[before:] if s.unconfirmed]
     assert "the robot rejects" in said[0].unconfirmed
+    assert robot.node.robot.collaboration.may_mislead
     assert not any(s.lost for s in said)
 
 

@@ -24,6 +24,7 @@ from cpcbl_agents.input_diagnosis.problems import (
     input_problems,
     is_often_refused,
 )
+from cpcbl_agents.input_diagnosis.unusual_motion import UnusualMotion
 from cpcbl_agents.robot import InputSnapshot
 from cpcbl_team.config import RobotSettings, Start, Team
 from cpcbl_team.geometry import Pose2, wrap_angle
@@ -147,7 +148,7 @@ class InputMonitor:
         self._is_driven, self._rejections = settings.source == "external", ""
         self._starts_known: bool | None = None
         self._jumps = JumpMonitor(start_ns, settings.odometry.moves)
-        self._errors = ImplausibleErrors()
+        self._errors, self._unusual = ImplausibleErrors(), UnusualMotion()
         self._confirmation = PoseConfirmation(
             is_start_known=not self._sees or _start_pose(settings.start) is not None,
             moves=settings.odometry.moves,
@@ -178,7 +179,13 @@ class InputMonitor:
     @property
     def unconfirmed(self) -> str:
         """What is not confirmed about the pose, and why; empty if nothing is missing."""
-        return self._confirmation.reason or self._rejections
+        return self._confirmation.reason or self._rejections or self._unusual.reason
+
+    @property
+    def may_mislead(self) -> bool:
+        """Whether the pose may be so wrong that help from it would mislead teammates."""
+        is_contradicted = bool(self._rejections or self._unusual.reason)
+        return is_contradicted or self._confirmation.may_be_mirrored
 
     def judge(
         self, snapshot: InputSnapshot, now_ns: int, namesake: bool
@@ -205,6 +212,8 @@ class InputMonitor:
             suspected_ns=snapshot.suspected_ns,
         )
         self._rejections = rejections_text(*snapshot.rejected) if self._is_driven else ""
+        if self._is_driven:
+            self._unusual.judge(odometry.steps, snapshot.accepted, bool(snapshot.lost))
         problems = input_problems(facts)
         self._judgements += any(self.inputs[name].messages for name in shown)
         is_early = self._judgements < OFTEN

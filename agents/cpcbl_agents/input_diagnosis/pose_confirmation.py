@@ -66,6 +66,12 @@ class PoseConfirmation:
         that has seen no landmark: its pose is not from its bearings."""
         return "" if self._has_seen is False else self._missing
 
+    @property
+    def may_be_mirrored(self) -> bool:
+        """Whether the whole pose is not confirmed, not its heading alone. If all bearings are off
+        by an angle, position and teammates are where the robot says; if they are mirrored, not."""
+        return bool(self.reason) and not self._is_heading_alone
+
     def judge(self, facts: InputFacts, jump: Jump | None, is_wrong: bool, now_ns: int) -> None:
         """To be called with each judgement of the inputs while the pose is not confirmed.
         `is_wrong`: whether the robot is lost, or its inputs are wrong; what came until now then
@@ -107,6 +113,7 @@ class PoseConfirmation:
         return shift is not None and contradicts_mistakes(shift, is_turn_known=order_is_right)
 
     def _text(self, is_heading_alone: bool) -> str:
+        self._is_heading_alone = is_heading_alone
         what = "heading" if is_heading_alone else "pose"
         like = "are off by an angle" if is_heading_alone else "are mirrored or off by an angle"
         if not self._moves:

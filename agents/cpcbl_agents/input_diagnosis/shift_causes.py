@@ -45,6 +45,7 @@ INLIERS = 0.7
 WORSE = 3.5  # times the errors that the settings say
 ROUNDS = 4  # of weights against outliers
 CUT = 3.0  # residuals, in their own scale
+FITTED = 3  # numbers, beside the place of each landmark: the gain, and the scale of turns
 MOST_TURN_RAD = 0.5  # beyond, the equations do not hold for wrong turns
 GROWING = 0.9  # the share of distances since the start that are larger than the one before
 SMALL = 0.2  # a gain that wheels which slip may have too
@@ -278,7 +279,10 @@ def _fitted(points: Sequence[Point], unsure: _Unsure) -> tuple[Shift, float, int
         ]
     if sums is None:
         return None
-    inflation = max(scale, 1.0) ** 2 * _repetition(points, sums.residuals(), unsure)
+    # Residuals of few points are smaller than the errors: the fit follows these
+    free = 2 * len(points) - 2 * len({p.name for p in points}) - FITTED
+    spread = scale * math.sqrt(2 * len(points) / max(free, 1))
+    inflation = max(spread, 1.0) ** 2 * _repetition(points, sums.residuals(), unsure)
     return sums.shift(inflation, unsure.drift_rad), scale, sum(far < CUT * scale for far in off)
 
 
