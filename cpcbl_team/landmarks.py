@@ -6,7 +6,7 @@ their evidence is added up. All other sightings (of walls and teammates, with si
 with faults) are left to `measurements.py`. `tests/core/test_landmarks.py` compares both ways.
 """
 
-import math
+from collections.abc import Sequence
 from math import sqrt
 from typing import Final
 
@@ -34,9 +34,10 @@ from cpcbl_team.estimate import (
 )
 from cpcbl_team.fusion import chi_square
 from cpcbl_team.gaussian import width_per_m
-from cpcbl_team.geometry import new, wrap_angle
+from cpcbl_team.geometry import Pose2, new, wrap_angle
 from cpcbl_team.inputs import Sighting
 from cpcbl_team.miscalibration import AS_CONFIGURED, Adaptation
+from cpcbl_team.range_errors import SeenLandmark
 from cpcbl_team.sensors import (
     LARGEST_BEARING_RAD,
     LARGEST_M,
@@ -46,7 +47,6 @@ from cpcbl_team.sensors import (
 from cpcbl_team.state import Evidence, LandmarkSnapshot, State
 
 _astuple: Final = msgspec.structs.astuple  # see `constraints._atan2`
-_hypot: Final = math.hypot
 Numbers = tuple[str, float | None, float | None, object, object, object, object]
 """Of a sighting, in its order; of a plain one the last four are None."""
 
@@ -58,6 +58,10 @@ class Mark:
         self.x, self.y = x, y
         self.gives_range = gives in ("both", "range")
         self.gives_bearing = gives in ("both", "bearing")
+
+
+Reading = tuple[Mark, float | None, float | None, float]
+"""Of a landmark: range (m), bearing (rad), and the variance (m^2) of the range."""
 
 
 class LandmarkUpdate:
@@ -231,24 +235,12 @@ class Landmarks:
         _, _, bias, _, factor, ranges = adaptation
         scale, offset_m, k = ranges.scale, ranges.offset_m, sqrt(factor)
         bearing_sigma = k * self._bearing_sigma_rad
-        pose_x, pose_y, _ = pose
-        first: dict[str, Sighting] = {}
-        for sighting in sightings:
-            first.setdefault(sighting.id, sighting)
         pieces = []
-        for name, sighting in first.items():
-            mark, sigma_m = self._marks[name], 0.0
-            numbers: Numbers = _astuple(sighting)
-            range_m, bearing = numbers[1], numbers[2]
-            if not mark.gives_range or range_m is None or range_m > self._farthest_m:
-                range_m = None
-            else:
-                distance = _hypot(mark.x - pose_x, mark.y - pose_y)
-                sigma_m = k * sqrt(self._range_variance(distance, range_m))
+        for name, (mark, range_m, bearing, variance) in self._readings(sightings, pose).items():
+            sigma_m = k * sqrt(variance)
+            if range_m is not None:
                 range_m = scale * range_m + offset_m
-            if not mark.gives_bearing:
-                bearing = None
-            elif bearing is not None and bias != 0.0:
+            if bearing is not None and bias != 0.0:
                 bearing = wrap_angle(bearing - bias)
             x, y = mark.x, mark.y
             # The last four are of teammates. (With a star a compiled tuple is made of a list.)
@@ -258,6 +250,33 @@ class Landmarks:
             )  # fmt: skip
             pieces.append(new(Evidence, piece))
         return pieces
+
+    def seen(self, snapshot: LandmarkSnapshot) -> list[SeenLandmark]:
+        """The landmarks of a snapshot that were seen with range and bearing."""
+        _, _, pose, sightings = snapshot
+        sigma, found = self._bearing_sigma_rad, []
+        for name, (mark, range_m, bearing, variance) in self._readings(sightings, pose).items():
+            if range_m is not None and bearing is not None:
+                found.append(SeenLandmark(name, mark.x, mark.y, range_m, bearing, variance, sigma))
+        return found
+
+    def _readings(self, sightings: Sequence[Sighting], pose: Pose2) -> dict[str, Reading]:
+        """What each landmark of a snapshot was seen with first, as far as it is used."""
+        pose_x, pose_y, _ = pose
+        readings: dict[str, Reading] = {}
+        for sighting in sightings:
+            numbers: Numbers = _astuple(sighting)
+            name, range_m, bearing, _, _, _, _ = numbers
+            if name in readings:
+                continue
+            mark, variance = self._marks[name], 0.0
+            if not mark.gives_range or range_m is None or range_m > self._farthest_m:
+                range_m = None
+            else:
+                dx, dy = mark.x - pose_x, mark.y - pose_y
+                variance = self._range_variance(sqrt(dx * dx + dy * dy), range_m)
+            readings[name] = mark, range_m, bearing if mark.gives_bearing else None, variance
+        return readings
 
 
 def _curved_weight(weight: float, prior: Covariance3, row: Row, curvature: float) -> float:

@@ -321,8 +321,14 @@ def with_records(
     until_ns: int,
 ) -> RecoveryMemory:
     """The recovery's memory with other evidence, and the sources of which no more is needed."""
-    records = snapshots, evidence, recorded, until_ns
-    return new(RecoveryMemory, (*recovery[:3], *records, *recovery[7:]))
+    lost, inflated_ns, relocated_ns, _, _, _, _, kidnapped_ns, suspected_ns, pose, mistake, jump = (
+        recovery
+    )
+    parts = (
+        lost, inflated_ns, relocated_ns, snapshots, evidence, recorded, until_ns,
+        kidnapped_ns, suspected_ns, pose, mistake, jump,
+    )  # fmt: skip
+    return new(RecoveryMemory, parts)
 
 
 def with_correction(state: State, estimate: Estimate, updates: Updates) -> State:
