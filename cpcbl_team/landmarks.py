@@ -131,14 +131,12 @@ class Landmarks:
         uses_range = scope is not None and scope is not HEADING
         uses_bearing = scope is not None and (scope is not POSITION or self._uses_rays)
         for sighting in sightings:
-            mark = marks.get(sighting.id)
-            if mark is None:
-                update.others.append(sighting)
-                continue
             numbers: Numbers = _astuple(sighting)
             name, range_m, bearing, range_sigma, bearing_sigma, facing, facing_sigma = numbers
+            mark = marks.get(name)
             if (
-                range_sigma is not None
+                mark is None
+                or range_sigma is not None
                 or bearing_sigma is not None
                 or facing is not None
                 or facing_sigma is not None

@@ -17,6 +17,7 @@ Only what the robot measures itself counts: a teammate's reports cannot change h
 
 import math
 from collections.abc import Sequence
+from math import cos, sin, sqrt
 from typing import Final, NamedTuple
 
 from cpcbl_team.config import OdometryNoise
@@ -39,9 +40,10 @@ from cpcbl_team.estimate import (
     Estimate,
     Matrix3,
     Row,
+    Six,
 )
 from cpcbl_team.geometry import Pose2, new, wrap_angle
-from cpcbl_team.motion import move
+from cpcbl_team.motion import covariance_after, distance_variance, turn_variance
 from cpcbl_team.range_errors import NO_RANGE_ERRORS, RangeErrors
 
 _atan2: Final = math.atan2  # see `constraints._atan2`
@@ -150,24 +152,26 @@ def after_path(
     begin: Corrected, check: ModelCheck, place_now: Pose2, noise: OdometryNoise
 ) -> tuple[Estimate, Matrix3]:
     """The estimate and the sensitivity at the end of a block by its odometry alone."""
-    _, estimate, place, _ = begin
-    sensitivity = check.sensitivity
-    for after in (*check.path, place_now):
-        pose, covariance, _ = estimate
-        pose_x, pose_y, pose_h = pose
-        place_x, place_y, place_h = place
-        x, y, heading = after
-        x, y, turn = x - place_x, y - place_y, wrap_angle(heading - place_h)
-        distance, course = math.sqrt(x * x + y * y), _atan2(y, x) - place_h + pose_h
-        start = new(Pose2, (pose_x, pose_y, course - 0.5 * turn))
-        moved, covariance, _ = move(
-            new(Estimate, (start, covariance, ZERO3)), distance, turn, noise
-        )
-        moved_x, moved_y, _ = moved
-        pose = new(Pose2, (moved_x, moved_y, wrap_angle(pose_h + turn)))
-        estimate, place = new(Estimate, (pose, covariance, ZERO3)), after
-        sensitivity = sensitivity_after(sensitivity, distance, turn, course)
-    return estimate, sensitivity
+    _, (pose, covariance, _), place, _ = begin
+    sensitivity, path = check.sensitivity, check.path
+    x, y, heading = pose
+    place_x, place_y, place_h = place
+    left: Six = covariance
+    for place_after in [*path, place_now]:
+        after_x, after_y, after_h = place_after
+        east, north = after_x - place_x, after_y - place_y
+        distance, turn = sqrt(east * east + north * north), wrap_angle(after_h - place_h)
+        c, s = cos(heading - place_h), sin(heading - place_h)
+        dx, dy = c * east - s * north, s * east + c * north  # in the field's frame
+        if distance > 0.0:
+            c, s = dx / distance, dy / distance
+        along = distance_variance(distance, turn, noise, 0.0)
+        left = covariance_after(left, distance, c, s, along, turn_variance(distance, turn, noise))
+        sensitivity = sensitivity_after(sensitivity, dx, dy, turn)
+        x, y, heading = x + dx, y + dy, wrap_angle(heading + turn)
+        place_x, place_y, place_h = after_x, after_y, after_h
+    parts = new(Pose2, (x, y, heading)), new(Covariance3, left), ZERO3
+    return new(Estimate, parts), sensitivity
 
 
 def check_models(check: ModelCheck, now: Corrected, noise: OdometryNoise) -> ModelCheck:
@@ -193,7 +197,7 @@ def check_models(check: ModelCheck, now: Corrected, noise: OdometryNoise) -> Mod
         return check.from_pose(now)
     taken, added = due.plus(left, -1.0), due.plus(before, -1.0)
     course = _atan2(y, x) - place.heading + pose.heading
-    c, s = math.cos(course), math.sin(course)
+    c, s = cos(course), sin(course)
     to_course = c, s, 0.0, -s, c, 0.0, 0.0, 0.0, 1.0
     dx, dy = pose_now.x - predicted.x, pose_now.y - predicted.y
     correction = c * dx + s * dy, c * dy - s * dx, wrap_angle(pose_now.heading - predicted.heading)

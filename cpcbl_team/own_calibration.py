@@ -106,16 +106,16 @@ class OwnCalibration:
             return self._after_learning(state)
         if not self._is_checked:
             return state
-        memory, now_ns = state.memory.calibration, state.stamp_ns
-        if memory.common is not None and not memory.common.is_precise:
+        now_ns, _, place, _, _, _, memory = state
+        _, _, calibration, _ = memory
+        _, _, _, check, present, _, _, common = calibration
+        if common is not None and not common.is_precise:
             return state  # corrections of the pose tell of the camera
-        check = memory.check
-        begin = check.begin
+        begin, _, _, _, _, _, _, _, path_ns = check
         if begin is None or now_ns - begin.stamp_ns >= BLOCK_NS:
             return self._after_check(self._with_ranges(state))
-        if now_ns - check.path_ns >= STEP_NS:
-            check = check.with_place(now_ns, state.odometry_from_robot)
-            return self._with_check(state, check, memory.adaptation)
+        if now_ns - path_ns >= STEP_NS:
+            return self._with_check(state, check.with_place(now_ns, place), present)
         return state
 
     def without_adaptation(self, state: State) -> State:

@@ -217,8 +217,9 @@ class RangeSums:
         w = weight / variance
         self._squares += w * error * error
         self._pairs += weight
-        for equations in (self._total, of_one, of_other):
-            equations.add(w, s, mean_b, error)
+        self._total.add(w, s, mean_b, error)
+        of_one.add(w, s, mean_b, error)
+        of_other.add(w, s, mean_b, error)
 
     def _of(self, name: str) -> NormalEquations:
         known = self._of_object.get(name)

@@ -76,7 +76,8 @@ class Updates(NamedTuple):
 def with_uses(objects_ns: Mapping[str, int], used: Mapping[str, int]) -> Mapping[str, int]:
     """The last uses of objects with these. Where there are too many, as after guests of ever new
     names, the older half is forgotten."""
-    uses = {**objects_ns, **used}
+    uses = dict(objects_ns)
+    uses.update(used)
     if len(uses) <= MOST_OBJECTS:
         return uses
     newest = sorted(uses, key=uses.__getitem__)[len(uses) // 2 :]

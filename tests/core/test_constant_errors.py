@@ -59,7 +59,8 @@ def test_the_sensitivity_is_what_a_small_error_leads_to(column: int) -> None:
     true = believed = Pose2(1.0, 2.0, 0.3)
     for distance, turn in ((0.4, 0.5), (0.3, -0.2)):
         course = believed.heading + 0.5 * turn
-        sensitivity = sensitivity_after(sensitivity, distance, turn, course)
+        dx, dy = distance * math.cos(course), distance * math.sin(course)
+        sensitivity = sensitivity_after(sensitivity, dx, dy, turn)
         moved = distance * (1.0 + errors[0]), turn * (1.0 + errors[1])
         # the heading that biased bearings give is smaller than the one in which the robot drives
         ahead = step(Pose2(true.x, true.y, true.heading + errors[2]), *moved)
