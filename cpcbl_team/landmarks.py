@@ -6,6 +6,7 @@ their evidence is added up. All other sightings (of walls and teammates, with si
 with faults) are left to `measurements.py`. `tests/core/test_landmarks.py` compares both ways.
 """
 
+import math
 from collections.abc import Sequence
 from math import sqrt
 from typing import Final
@@ -47,6 +48,7 @@ from cpcbl_team.sensors import (
 from cpcbl_team.state import Evidence, LandmarkSnapshot, State
 
 _astuple: Final = msgspec.structs.astuple  # see `constraints._atan2`
+_hypot: Final = math.hypot
 Numbers = tuple[str, float | None, float | None, object, object, object, object]
 """Of a sighting, in its order; of a plain one the last four are None."""
 
@@ -271,8 +273,8 @@ class Landmarks:
             if not mark.gives_range or range_m is None or range_m > self._farthest_m:
                 range_m = None
             else:
-                dx, dy = mark.x - pose_x, mark.y - pose_y
-                variance = self._range_variance(sqrt(dx * dx + dy * dy), range_m)
+                distance = _hypot(mark.x - pose_x, mark.y - pose_y)
+                variance = self._range_variance(distance, range_m)
             readings[name] = mark, range_m, bearing if mark.gives_bearing else None, variance
         return readings
 
