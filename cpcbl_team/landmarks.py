@@ -62,8 +62,15 @@ class Mark:
         self.gives_bearing = gives in ("both", "bearing")
 
 
-Reading = tuple[Mark, float | None, float | None, float]
-"""Of a landmark: range (m), bearing (rad), and the variance (m^2) of the range."""
+class Reading:
+    """What a landmark was seen with, as far as it is used: range (m), bearing (rad), and the
+    variance (m^2) of the range."""
+
+    def __init__(
+        self, name: str, mark: Mark, range_m: float | None, bearing: float | None, variance: float
+    ) -> None:
+        self.name, self.x, self.y = name, mark.x, mark.y
+        self.range_m, self.bearing, self.variance = range_m, bearing, variance
 
 
 class LandmarkUpdate:
@@ -236,13 +243,13 @@ class Landmarks:
         scale, offset_m, k = ranges.scale, ranges.offset_m, sqrt(factor)
         bearing_sigma = k * self._bearing_sigma_rad
         pieces = []
-        for name, (mark, range_m, bearing, variance) in self._readings(sightings, pose).items():
-            sigma_m = k * sqrt(variance)
+        for reading in self._readings(sightings, pose):
+            name, x, y, sigma_m = reading.name, reading.x, reading.y, k * sqrt(reading.variance)
+            range_m, bearing = reading.range_m, reading.bearing
             if range_m is not None:
                 range_m = scale * range_m + offset_m
             if bearing is not None and bias != 0.0:
                 bearing = wrap_angle(bearing - bias)
-            x, y = mark.x, mark.y
             # The last four are of teammates. (With a star a compiled tuple is made of a list.)
             piece = (
                 stamp_ns, place, name, x, y, range_m, bearing, sigma_m, bearing_sigma,
@@ -255,27 +262,31 @@ class Landmarks:
         """The landmarks of a snapshot that were seen with range and bearing."""
         _, _, pose, sightings = snapshot
         sigma, found = self._bearing_sigma_rad, []
-        for name, (mark, range_m, bearing, variance) in self._readings(sightings, pose).items():
-            if range_m is not None and bearing is not None:
-                found.append(SeenLandmark(name, mark.x, mark.y, range_m, bearing, variance, sigma))
+        for r in self._readings(sightings, pose):
+            if r.range_m is not None and r.bearing is not None:
+                seen = SeenLandmark(r.name, r.x, r.y, r.range_m, r.bearing, r.variance, sigma)
+                found.append(seen)
         return found
 
-    def _readings(self, sightings: Sequence[Sighting], pose: Pose2) -> dict[str, Reading]:
+    def _readings(self, sightings: Sequence[Sighting], pose: Pose2) -> list[Reading]:
         """What each landmark of a snapshot was seen with first, as far as it is used."""
         pose_x, pose_y, _ = pose
-        readings: dict[str, Reading] = {}
+        readings: list[Reading] = []
+        names: set[str] = set()
         for sighting in sightings:
             numbers: Numbers = _astuple(sighting)
             name, range_m, bearing, _, _, _, _ = numbers
-            if name in readings:
+            if name in names:
                 continue
+            names.add(name)
             mark, variance = self._marks[name], 0.0
             if not mark.gives_range or range_m is None or range_m > self._farthest_m:
                 range_m = None
             else:
                 distance = _hypot(mark.x - pose_x, mark.y - pose_y)
                 variance = self._range_variance(distance, range_m)
-            readings[name] = mark, range_m, bearing if mark.gives_bearing else None, variance
+            bearing = bearing if mark.gives_bearing else None
+            readings.append(Reading(name, mark, range_m, bearing, variance))
         return readings
 
 
