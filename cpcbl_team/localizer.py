@@ -110,8 +110,9 @@ class Localizer:
         state, scope, landmarks, others = self.measure(state, frame)  # 2. measurements
         if scope is None:  # nothing may be updated
             return self.recovery.check(state)
-        common = state.common_errors
-        gated = self.constrain(state.estimate, others, scope, common) if others else _NO_OBJECTS
+        gated = _NO_OBJECTS
+        if others:
+            gated = self.constrain(state.estimate, others, scope, state.common_errors)
         if self.screen.has_recent_reports(state, now):  # beyond the paper: trust
             state, gated = self.screen.screen_frame(state, landmarks, gated)
         if self._camera is None:

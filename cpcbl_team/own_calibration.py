@@ -10,16 +10,16 @@ from collections.abc import Iterable, Sequence
 from cpcbl_team.config import Field, LocalizationSettings, OdometryNoise
 from cpcbl_team.constant_errors import NO_ERRORS, NO_EVIDENCE, pose_offset
 from cpcbl_team.estimate import POSE, offset_pose
-from cpcbl_team.geometry import new
+from cpcbl_team.geometry import new, wrap_angle
 from cpcbl_team.landmarks import Landmarks, LandmarkUpdate
 from cpcbl_team.map_residuals import Reading
 from cpcbl_team.measurements import GatedObject
 from cpcbl_team.miscalibration import (
+    ARC_RAD,
     AS_CONFIGURED,
     BLOCK_NS,
     LEAST_DISTANCE_M,
     LEAST_PARTS,
-    STEP_NS,
     Adaptation,
     Corrected,
     ModelCheck,
@@ -31,10 +31,10 @@ from cpcbl_team.miscalibration import (
     noise_with_factor,
 )
 from cpcbl_team.motion import NO_VARIANCE, MotionVariance, distance_variance, turn_variance
-from cpcbl_team.range_errors import NO_RANGE_ERRORS, RangeErrors, Seen
+from cpcbl_team.range_errors import NO_RANGE_ERRORS, RangeErrors, SeenLandmark
 from cpcbl_team.recovery_evidence import SPACING_NS
 from cpcbl_team.self_calibration import ReferencePose, ReferencePoses, self_calibrate
-from cpcbl_team.state import CalibrationMemory, Evidence, Memory, RecoveryMemory, State, with_memory
+from cpcbl_team.state import CalibrationMemory, Memory, RecoveryMemory, State, with_memory
 
 
 class OwnCalibration:
@@ -110,17 +110,17 @@ class OwnCalibration:
             return self._after_learning(state)
         if not self._is_checked:
             return state
-        memory, now_ns = state.memory.calibration, state.stamp_ns
-        if memory.common is not None and not memory.common.is_precise:
+        now_ns, _, place, _, _, _, memory = state
+        _, _, calibration, _ = memory
+        _, _, _, check, present, _, _, common, _ = calibration
+        if common is not None and not common.is_precise:
             return state  # corrections of the pose tell of the camera
-        check = memory.check
-        begin, ahead = check.begin, check.ahead
-        if begin is None or ahead is None or now_ns - begin.stamp_ns >= BLOCK_NS:
+        begin, _, _, _, _, _, _, _, path_heading = check
+        if begin is None or now_ns - begin.stamp_ns >= BLOCK_NS:
             return self._after_check(self._with_ranges(self._with_residuals(state)))
-        if now_ns - ahead.stamp_ns >= STEP_NS:
-            noise = noise_with_factor(self._noise, memory.adaptation.motion_factor)
-            check = check.with_step(now_ns, state.odometry_from_robot, noise)
-            return self._with_check(state, check, memory.adaptation)
+        _, _, heading = place
+        if abs(wrap_angle(heading - path_heading)) > ARC_RAD:
+            return self._with_check(state, check.with_place(place), present)
         return state
 
     def without_adaptation(self, state: State) -> State:
@@ -157,10 +157,9 @@ class OwnCalibration:
         memory, recovery = state.memory.calibration, state.memory.recovery
         if memory.check.begin is None or recovery.lost:
             return state
-        ranges = memory.ranges
         present = memory.adaptation
-        for frame in self._frames_since(recovery, memory.check.begin.stamp_ns, present.ranges):
-            ranges = ranges.plus(frame)
+        frames = self._frames_since(recovery, memory.check.begin.stamp_ns, present.ranges)
+        ranges = memory.ranges.plus(frames)
         errors = ranges.errors(present.ranges, self._independent_frames)
         if errors != present.ranges:
             if present.ranges == NO_RANGE_ERRORS:
@@ -172,21 +171,19 @@ class OwnCalibration:
 
     def _frames_since(
         self, recovery: RecoveryMemory, since_ns: int, present: RangeErrors
-    ) -> Iterable[list[Seen]]:
+    ) -> Iterable[list[SeenLandmark]]:
         """The landmarks that were seen with range and bearing after this time, by frames."""
-        pieces: list[Evidence] = []
+        frames: dict[int, list[SeenLandmark]] = {}
         for e in recovery.evidence:
-            if e.stamp_ns > since_ns and not e.from_teammate and e.range_m is not None:
-                read_m = (e.range_m - present.offset_m) / present.scale  # these are corrected
-                pieces.append(e._replace(range_m=read_m))
+            stamp_ns, _, name, x, y, range_m, bearing, sigma_m, sigma_rad, _, of_teammate, _, _ = e
+            if stamp_ns <= since_ns or of_teammate or range_m is None or bearing is None:
+                continue
+            read_m = (range_m - present.offset_m) / present.scale  # these are corrected
+            seen = SeenLandmark(name, x, y, read_m, bearing, sigma_m * sigma_m, sigma_rad)
+            frames.setdefault(stamp_ns, []).append(seen)
         for snapshot in recovery.snapshots:
             if snapshot[0] > since_ns:
-                pieces += self._landmarks.evidence_of(snapshot)
-        frames: dict[int, list[Seen]] = {}
-        for stamp_ns, _, name, x, y, range_m, bearing, sigma_m, sigma_rad, _, _, _, _ in pieces:
-            if range_m is not None and bearing is not None:
-                seen = new(Seen, (name, x, y, range_m, bearing, sigma_m, sigma_rad))
-                frames.setdefault(stamp_ns, []).append(seen)
+                frames.setdefault(snapshot[0], []).extend(self._landmarks.seen(snapshot))
         return frames.values()
 
     def _after_learning(self, state: State) -> State:
@@ -238,7 +235,8 @@ class OwnCalibration:
         evidence = NO_EVIDENCE
         if errors != NO_ERRORS:
             evidence = check.evidence.without(errors)
-        check = ModelCheck(now, check.sensitivity, evidence, 0, "", accepted, doubts, now)
+        check = check.with_block(now, check.sensitivity, evidence)
+        check = check._replace(rejections=0, rejected="", accepted=accepted)
         return self._with_check(state.counted("miscalibrated"), check, changed)
 
     def _with_check(self, state: State, check: ModelCheck, present: Adaptation) -> State:

@@ -77,7 +77,8 @@ class Updates(NamedTuple):
 def with_uses(objects_ns: Mapping[str, int], used: Mapping[str, int]) -> Mapping[str, int]:
     """The last uses of objects with these. Where there are too many, as after guests of ever new
     names, the older half is forgotten."""
-    uses = {**objects_ns, **used}
+    uses = dict(objects_ns)
+    uses.update(used)
     if len(uses) <= MOST_OBJECTS:
         return uses
     newest = sorted(uses, key=uses.__getitem__)[len(uses) // 2 :]
@@ -327,8 +328,14 @@ def with_records(
     until_ns: int,
 ) -> RecoveryMemory:
     """The recovery's memory with other evidence, and the sources of which no more is needed."""
-    records = snapshots, evidence, recorded, until_ns
-    return new(RecoveryMemory, (*recovery[:3], *records, *recovery[7:]))
+    lost, inflated_ns, relocated_ns, _, _, _, _, kidnapped_ns, suspected_ns, pose, mistake, jump = (
+        recovery
+    )
+    parts = (
+        lost, inflated_ns, relocated_ns, snapshots, evidence, recorded, until_ns,
+        kidnapped_ns, suspected_ns, pose, mistake, jump,
+    )  # fmt: skip
+    return new(RecoveryMemory, parts)
 
 
 def with_correction(state: State, estimate: Estimate, updates: Updates) -> State:
