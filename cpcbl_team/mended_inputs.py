@@ -16,7 +16,7 @@ def with_mended_inputs(state: State, event: InputsMended) -> State:
     grown = covariance.plus(Covariance3(p, 0.0, p, 0.0, 0.0, h))
     pose = new(Pose2, (x, y, wrap_angle(heading + event.turn_rad)))
     state = state._replace(estimate=Estimate(pose, grown, shared))
-    recovery = state.memory.recovery._replace(trusted=None, mistake="")
+    recovery = state.memory.recovery._replace(trusted=None, mistake="", suspected_ns=-1)
     state = with_recovery(state, recovery)
     teammates = state.memory.teammates
     senders = forgive(teammates.senders, event.stamp_ns)

@@ -19,8 +19,13 @@ from cpcbl_team.miscalibration import (
     noise_with_factor,
 )
 from cpcbl_team.recovery_evidence import WINDOW_NS, latest
-from cpcbl_team.relocalization import UNKNOWNS, readings_of, relocalize
-from cpcbl_team.sensor_mistakes import ExplainingMistake
+from cpcbl_team.relocalization import UNKNOWNS, are_apart, readings_of, relocalize
+from cpcbl_team.sensor_mistakes import (
+    MIRRORED,
+    ExplainingMistake,
+    is_mirror_image,
+    mirrored,
+)
 from cpcbl_team.state import (
     Evidence,
     RecoveryMemory,
@@ -31,6 +36,7 @@ from cpcbl_team.state import (
 from cpcbl_team.trust import reset_scores
 from cpcbl_team.trusted_pose import (
     agrees,
+    expected_pose,
     explaining_mistake,
     keep_trusted_pose,
     trusted_pose,
@@ -214,7 +220,7 @@ class Recovery:
         found = self._relocalized(state, own)
         if found is None or agrees(state.estimate, found):
             return with_recovery(state, memory)
-        if mistake := self._explaining_mistake(state, memory, found):
+        if mistake := self._explaining_mistake(state, memory, found, own):
             return self._at_trusted_pose(state.counted("lost"), memory, mistake)
         return self._found(state.counted("lost"), found, memory)
 
@@ -235,7 +241,7 @@ class Recovery:
         if evidence and evidence[-1].stamp_ns > memory.relocalization_ns:
             memory = memory._replace(relocalization_ns=evidence[-1].stamp_ns)
             found = self._relocalized(state, evidence)
-            if mistake := self._explaining_mistake(state, memory, found):
+            if mistake := self._explaining_mistake(state, memory, found, evidence):
                 return self._at_trusted_pose(state, memory, mistake)
             if found is not None:
                 return self._found(state, found, memory)
@@ -255,7 +261,8 @@ class Recovery:
         """The state of a robot that is no longer lost, because it accepts what it measures; unless
         a mistake explains that as well."""
         memory = state.memory.recovery
-        if mistake := self._explaining_mistake(state, memory, state.estimate):
+        evidence = self._evidence_since(state, max(memory.kidnapped_ns, memory.suspected_ns))
+        if mistake := self._explaining_mistake(state, memory, state.estimate, evidence):
             return self._at_trusted_pose(state, memory, mistake)
         memory = with_jump(state, memory, state.estimate.pose)
         return with_recovery(state, memory._replace(lost="", kidnapped_ns=-1))
@@ -294,10 +301,24 @@ class Recovery:
         return tuple(e for e in pieces if e.stamp_ns > stamp_ns)
 
     def _explaining_mistake(
-        self, state: State, memory: RecoveryMemory, found: Estimate | None
+        self,
+        state: State,
+        memory: RecoveryMemory,
+        found: Estimate | None,
+        evidence: tuple[Evidence, ...],
     ) -> ExplainingMistake | None:
-        evidence = self.evidence(memory, state.memory.calibration.adaptation)
-        return explaining_mistake(state, memory, evidence, found)
+        """The driver's mistake that explains the latest evidence, or that in which a pose was
+        found; None without one."""
+        latest = self.evidence(memory, state.memory.calibration.adaptation)
+        if mistake := explaining_mistake(state, memory, latest, found):
+            return mistake
+        expected = expected_pose(state, memory)
+        if found is None or not are_apart(found.pose, expected.pose):
+            return None
+        of_mirrored = self._relocalized(state, mirrored(evidence))
+        if of_mirrored is None or not is_mirror_image(found.pose, of_mirrored.pose, expected):
+            return None
+        return ExplainingMistake(MIRRORED, of_mirrored.pose)
 
     def _at_trusted_pose(
         self, state: State, memory: RecoveryMemory, mistake: ExplainingMistake | None

@@ -29,6 +29,8 @@ MOST_SIGMA_RAD: Final = 0.25
 MOST_TURN_RAD: Final = 1.0  # since a piece of evidence: beyond, odometry errs too much to tell,
 MOST_WAY_M: Final = 2.0  # and beyond this
 FOOT_M: Final = 0.3048
+NEAR_SHARE: Final = 0.25  # of the way to a pose that was found: nearer is another explanation
+NEAR_RAD: Final = 0.7
 
 
 View = Callable[[complex, float], complex]
@@ -101,6 +103,24 @@ def mistake_in_evidence(
         if best is not None:
             return best
     return None
+
+
+def mirrored(evidence: Sequence[Evidence]) -> tuple[Evidence, ...]:
+    """The evidence of the robot's own bearings, with left and right exchanged."""
+    own = (e for e in evidence if not e.from_teammate and e.bearing_rad is not None)
+    return tuple(e._replace(bearing_rad=-(e.bearing_rad or 0.0)) for e in own)
+
+
+def is_mirror_image(found: Pose2, of_mirrored: Pose2, expected: Estimate) -> bool:
+    """Whether a robot that odometry expects at one pose, and whose evidence fits far from there, is
+    rather where the mirrored evidence fits. Two landmarks fit both; that a robot was carried just
+    to the mirror image of where it was is improbable."""
+    (x, y, heading), c = expected.pose, expected.covariance
+    most_m = NEAR_SHARE * math.hypot(found.x - x, found.y - y)
+    is_known = 0.5 * (c.xx + c.yy) < most_m**2 and c.hh < NEAR_RAD**2
+    turn = math.remainder(of_mirrored.heading - heading, math.tau)
+    is_near = math.hypot(of_mirrored.x - x, of_mirrored.y - y) < most_m and abs(turn) < NEAR_RAD
+    return is_known and is_near
 
 
 def _is_usable(e: Evidence, place: Pose2) -> bool:

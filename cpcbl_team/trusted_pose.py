@@ -32,6 +32,12 @@ def propagated_pose(trusted: TrustedPose, odometry_from_robot: Pose2) -> Estimat
     return Estimate(pose, trusted.estimate.covariance.plus(Covariance3(p, 0.0, p, 0.0, 0.0, h)))
 
 
+def expected_pose(state: State, memory: RecoveryMemory) -> Estimate:
+    """Where odometry alone leads the robot from its trusted pose, or else its estimate."""
+    place = state.odometry_from_robot
+    return propagated_pose(memory.trusted or trusted_pose(state), place)
+
+
 def agrees(estimate: Estimate, found: Estimate) -> bool:
     """Whether a pose from recent evidence is the estimate's, by the chi-square bound of 99.9 %; a
     small difference may have other causes than a wrong pose."""
@@ -69,9 +75,7 @@ def keep_trusted_pose(
     """The state of a robot whose driver probably makes a mistake: it is lost, and stays where it
     is if the mistake is undone. Between two pieces of evidence (`mistake` is None) odometry leads
     it. `reduce`: to the form that the variant keeps."""
-    trusted, place = memory.trusted, state.odometry_from_robot
-    if trusted is None:
-        return state
+    trusted, place = memory.trusted or trusted_pose(state), state.odometry_from_robot
     if mistake is not None:
         lost = f"{mistake.text}; {OR_MOVED}"
         corrected = Estimate(mistake.pose, trusted.estimate.covariance)

@@ -43,6 +43,7 @@ class InputSnapshot(NamedTuple):
     mistake: str = ""  # of the driver, that explains why the robot is lost
     jump: Jump | None = None  # the latest
     rejected: tuple[int, int] = (0, 0)  # of the latest innovations, and how many these are
+    suspected_ns: int = -1  # since when it rejects more than it should; -1: it does not
 
 
 class Robot:
@@ -114,9 +115,15 @@ class Robot:
         is_camera_lost = camera["camera_lost"] > camera["camera_back"]
         known, recovery = state.memory.calibration, state.memory.recovery
         pose = state.estimate, recovery.lost, known
-        rejected = rejected_of(state.updates.innovations)
-        found = recovery.mistake, recovery.jump, rejected
-        return InputSnapshot(*pose, refused, is_camera_lost, *found)
+        return InputSnapshot(
+            *pose,
+            refused,
+            is_camera_lost,
+            mistake=recovery.mistake,
+            jump=recovery.jump,
+            rejected=rejected_of(state.updates.innovations),
+            suspected_ns=recovery.suspected_ns,
+        )
 
     def pose(self, now_ns: int) -> Pose:
         """The pose at `now_ns`, or at the end of the newest odometry."""

@@ -198,6 +198,7 @@ class InputMonitor:
             namesake=self._namesake_for >= NAMESAKE_JUDGEMENTS,
             camera_lost=snapshot.is_camera_lost,
             mistake=snapshot.mistake,
+            suspected_ns=snapshot.suspected_ns,
         )
         self._rejections = rejections_text(*snapshot.rejected) if self._is_driven else ""
         problems = input_problems(facts)
@@ -207,7 +208,8 @@ class InputMonitor:
         if is_due or is_early or self._judgements % SELDOM == 0:
             facts = self._with_latest(snapshot, facts, before.now_ns)
             self._implausible = self._find_implausible(snapshot, facts, bool(problems), now_ns)
-        are_wrong = bool(self._implausible) or any(map(is_often_refused, facts.windows.values()))
+        are_refused = any(map(is_often_refused, facts.windows.values()))
+        are_wrong = bool(self._implausible or snapshot.mistake) or are_refused
         self.are_mended, self._are_wrong = self._are_wrong and not are_wrong, are_wrong
         health = tuple(self._health(name, totals, before) for name in shown)
         said = (*problems, *self._implausible)

@@ -2,12 +2,12 @@
 
 from collections import Counter
 
-from cpcbl_agents.input_diagnosis.motion_causes import OR_START
+from cpcbl_agents.input_diagnosis.motion_causes import CONTRADICTION, OR_START
 from cpcbl_agents.input_diagnosis.problems import without_numbers
 from cpcbl_team.trusted_pose import OR_MOVED
 
 OVER = 4  # judgements in a row that find nothing, before a cause is no longer reported
-CHANGED = 30  # judgements in a row that find another cause, before it replaces the first
+CHANGED = 30  # judgements in a row that find another cause, before it replaces a cause
 
 
 class ProblemHysteresis:
@@ -50,7 +50,8 @@ class ProblemHysteresis:
         if not text:
             del self._candidates[about]
         self._misses[about] += 1
-        if reported and self._misses[about] < (CHANGED if text else OVER):
+        is_cause = bool(reported) and CONTRADICTION not in reported
+        if reported and self._misses[about] < (CHANGED if text and is_cause else OVER):
             return
         self._reported.pop(about, None)
         if is_again:

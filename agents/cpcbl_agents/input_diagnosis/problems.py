@@ -121,6 +121,7 @@ class InputFacts(NamedTuple):
     camera_lost: bool = False
     unseen: str = ""  # why sightings should come that do not
     mistake: str = ""  # in sightings, that explains why the robot is lost
+    suspected_ns: int = -1  # the stamp since when sightings may have this mistake
 
 
 def input_problems(facts: InputFacts) -> tuple[str, ...]:
@@ -359,11 +360,10 @@ def _view_cause(
 
 
 def contradicts_mistake(facts: InputFacts) -> bool:
-    """Whether landmarks move so that no mistake in sightings is left that explains why the robot is
-    lost."""
+    """Whether landmarks have moved since then as no mistake in sightings lets them move."""
     if not facts.mistake or not _odometry(facts):
         return False
-    shift = shift_of_frames(facts)
+    shift = shift_of_frames(facts, facts.suspected_ns)
     return shift is not None and contradicts_mistakes(shift)
 
 
