@@ -155,7 +155,7 @@ class OwnCalibration:
             frames.setdefault(stamp_ns, []).append(seen)
         for snapshot in recovery.snapshots:
             if snapshot[0] > since_ns:
-                frames.setdefault(snapshot[0], []).extend(self._landmarks.seen(snapshot))
+                frames.setdefault(snapshot[0], []).extend(self._landmarks.seen_landmarks(snapshot))
         return frames.values()
 
     def _after_learning(self, state: State) -> State:
