@@ -258,7 +258,7 @@ class Landmarks:
             pieces.append(new(Evidence, piece))
         return pieces
 
-    def seen(self, snapshot: LandmarkSnapshot) -> list[SeenLandmark]:
+    def seen_landmarks(self, snapshot: LandmarkSnapshot) -> list[SeenLandmark]:
         """The landmarks of a snapshot that were seen with range and bearing."""
         _, _, pose, sightings = snapshot
         sigma, found = self._bearing_sigma_rad, []

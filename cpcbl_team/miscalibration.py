@@ -48,7 +48,7 @@ from cpcbl_team.range_errors import NO_RANGE_ERRORS, RangeErrors
 
 _atan2: Final = math.atan2  # see `constraints._atan2`
 BLOCK_NS: Final = 1_500_000_000
-ARC_RAD: Final = 0.2  # a turn that ends an arc of a block's path
+STEP_NS: Final = 375_000_000  # an arc of a block's path
 LONGEST_NS: Final = 5_000_000_000
 MOST_TURN_RAD: Final = 2.5  # beyond, the chord of a block is much shorter than its path
 LEAST_DISTANCE_M: Final = 0.02
@@ -99,8 +99,8 @@ class ModelCheck(NamedTuple):
     accepted: int = 0  # since so many observations were accepted
     doubts: Row = NO_ERRORS  # variances of constant errors that the settings may still have
     path: tuple[Pose2, ...] = ()
-    """Where the odometry has led since the block began, one pose an arc."""
-    path_heading: float = 0.0  # of the last of them, or of the block's begin
+    """Where the odometry has led since the block began, one pose each 0.375 s."""
+    path_ns: int = 0  # the time of the last one, or of the block's begin
 
     def restarted(self, accepted: int) -> "ModelCheck":
         """For a robot that was lost: what it rejected then tells nothing."""
@@ -110,13 +110,12 @@ class ModelCheck(NamedTuple):
         """With a block that begins now, after one that tells nothing."""
         return self.with_block(now, INSENSITIVE, self.evidence)
 
-    def with_place(self, place: Pose2) -> "ModelCheck":
-        """With where the odometry has led until now: there an arc ends. How a turn's noise moves
-        the position depends on the path."""
+    def with_place(self, stamp_ns: int, place: Pose2) -> "ModelCheck":
+        """With where the odometry has led until now. A block has several arcs: how a turn's noise
+        moves the position depends on the path."""
         begin, sensitivity, evidence, number, last, accepted, doubts, path, _ = self
-        _, _, heading = place
         path = (*path, place)
-        check = begin, sensitivity, evidence, number, last, accepted, doubts, path, heading
+        check = begin, sensitivity, evidence, number, last, accepted, doubts, path, stamp_ns
         return new(ModelCheck, check)
 
     def with_block(
@@ -124,9 +123,8 @@ class ModelCheck(NamedTuple):
     ) -> "ModelCheck":
         """With another block. (`_replace` would take as long as the rest of it.)"""
         _, _, _, number, last, accepted, doubts, _, _ = self
-        _, _, place, _ = begin
-        _, _, heading = place
-        check = begin, sensitivity, evidence, number, last, accepted, doubts, (), heading
+        stamp_ns, _, _, _ = begin
+        check = begin, sensitivity, evidence, number, last, accepted, doubts, (), stamp_ns
         return new(ModelCheck, check)
 
     def with_rejections(self, names: Sequence[str]) -> "ModelCheck":

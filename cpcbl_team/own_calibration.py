@@ -10,16 +10,16 @@ from collections.abc import Iterable, Sequence
 from cpcbl_team.config import Field, LocalizationSettings, OdometryNoise
 from cpcbl_team.constant_errors import NO_ERRORS, NO_EVIDENCE, pose_offset
 from cpcbl_team.estimate import POSE, offset_pose
-from cpcbl_team.geometry import new, wrap_angle
+from cpcbl_team.geometry import new
 from cpcbl_team.landmarks import Landmarks, LandmarkUpdate
 from cpcbl_team.map_residuals import Reading
 from cpcbl_team.measurements import GatedObject
 from cpcbl_team.miscalibration import (
-    ARC_RAD,
     AS_CONFIGURED,
     BLOCK_NS,
     LEAST_DISTANCE_M,
     LEAST_PARTS,
+    STEP_NS,
     Adaptation,
     Corrected,
     ModelCheck,
@@ -115,12 +115,11 @@ class OwnCalibration:
         _, _, _, check, present, _, _, common, _ = calibration
         if common is not None and not common.is_precise:
             return state  # corrections of the pose tell of the camera
-        begin, _, _, _, _, _, _, _, path_heading = check
+        begin, _, _, _, _, _, _, _, path_ns = check
         if begin is None or now_ns - begin.stamp_ns >= BLOCK_NS:
             return self._after_check(self._with_ranges(self._with_residuals(state)))
-        _, _, heading = place
-        if abs(wrap_angle(heading - path_heading)) > ARC_RAD:
-            return self._with_check(state, check.with_place(place), present)
+        if now_ns - path_ns >= STEP_NS:
+            return self._with_check(state, check.with_place(now_ns, place), present)
         return state
 
     def without_adaptation(self, state: State) -> State:
@@ -183,7 +182,7 @@ class OwnCalibration:
             frames.setdefault(stamp_ns, []).append(seen)
         for snapshot in recovery.snapshots:
             if snapshot[0] > since_ns:
-                frames.setdefault(snapshot[0], []).extend(self._landmarks.seen(snapshot))
+                frames.setdefault(snapshot[0], []).extend(self._landmarks.seen_landmarks(snapshot))
         return frames.values()
 
     def _after_learning(self, state: State) -> State:
@@ -235,8 +234,9 @@ class OwnCalibration:
         evidence = NO_EVIDENCE
         if errors != NO_ERRORS:
             evidence = check.evidence.without(errors)
-        check = check.with_block(now, check.sensitivity, evidence)
-        check = check._replace(rejections=0, rejected="", accepted=accepted)
+        check = ModelCheck(
+            now, check.sensitivity, evidence, 0, "", accepted, doubts, (), now.stamp_ns
+        )
         return self._with_check(state.counted("miscalibrated"), check, changed)
 
     def _with_check(self, state: State, check: ModelCheck, present: Adaptation) -> State:
