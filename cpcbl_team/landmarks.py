@@ -140,12 +140,14 @@ class Landmarks:
         uses_range = scope is not None and scope is not HEADING
         uses_bearing = scope is not None and (scope is not POSITION or self._uses_rays)
         for sighting in sightings:
+            mark = marks.get(sighting.id)
+            if mark is None:  # a teammate, whose sighting may have more numbers
+                update.others.append(sighting)
+                continue
             numbers: Numbers = _astuple(sighting)
             name, range_m, bearing, range_sigma, bearing_sigma, facing, facing_sigma = numbers
-            mark = marks.get(name)
             if (
-                mark is None
-                or range_sigma is not None
+                range_sigma is not None
                 or bearing_sigma is not None
                 or facing is not None
                 or facing_sigma is not None
