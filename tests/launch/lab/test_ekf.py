@@ -130,8 +130,8 @@ def test_an_outlier_is_gated_and_a_faulty_sighting_ignored() -> None:
 
 
 def test_the_covariance_grows_after_the_end_of_odometry() -> None:
-    """By 0.3 m and as far as the last speed leads, both for a second, after `timeout_s`; the heading
-    by as many radians, for a robot that drove may turn."""
+    """By 0.3 m and as far as the last speed leads, both for a second, after `timeout_s`; the
+    heading by as many radians, for a robot that drove may turn."""
     ekf = Ekf({"r": inputs_at(Pose2(0.0, 0.0, 0.0), Odometry(0, 100_000_000, 0.05, 0.0))}, Field())
     ekf.predict("r", 600_000_000)
     before = ekf.marginal("r")[1]
