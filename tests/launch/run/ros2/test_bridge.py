@@ -65,12 +65,13 @@ def until_it(act: Callable[[], None], has_worked: Callable[[], bool]) -> None:
 def stand(team: Team, now_ns: Callable[[], int] = time.time_ns) -> Iterator[Stand]:
     endpoint = free_endpoint()
     assert team.ros2 is not None
-    settings = NodeSettings(connect=(endpoint,), name="robots")
+    ours = node_settings(team.ros2, [endpoint])
+    settings = NodeSettings(connect=(endpoint,), name="robots", layout=ours.layout)
     with (
         open_router(team.name, [endpoint]),
         open_bus(team.name, [endpoint]) as own,
         open_bus(team.name, [endpoint]) as bus,
-        open_node(node_settings(team.ros2, [endpoint])) as node,
+        open_node(ours) as node,
         open_node(settings) as robots,
     ):
         inputs: list[Any] = []
@@ -192,13 +193,17 @@ def test_simulated_time_comes_back_as_it_went_in() -> None:
         assert (stamp.sec, stamp.nanosec) == (12, 900_000_000)
 
 
-@pytest.mark.parametrize("changes", [(), (("[ros2]", "[ros2]\nsim_time = true"),)])
+SIMULATED = (("[ros2]", "[ros2]\nsim_time = true"),)
+BEHIND_DDS = (("[ros2]", '[ros2]\nlayout = "ros2dds"'),)
+
+
+@pytest.mark.parametrize("changes", [(), SIMULATED, BEHIND_DDS])
 def test_the_button_of_rviz_sets_the_pose(changes: tuple[tuple[str, str], ...]) -> None:
     with stand(lab(*changes)) as own:
         rviz = own.robots.publisher("r1/initialpose", types.POSE)
         assert eventually(lambda: rviz.matching)
         now_ns = time.time_ns()
-        for stamp_ns in (now_ns, 0, 12_000 * MS if changes else now_ns):
+        for stamp_ns in (now_ns, 0, 12_000 * MS if changes is SIMULATED else now_ns):
             rviz.publish(pose_stamped(stamp_ns, Pose2(1.0, 2.0, 0.5), 0.5))
         rviz.publish(pose_stamped(now_ns, Pose2(1.0, 2.0, 0.5), 0.5, frame="odom"))
         assert eventually(lambda: len(own.inputs) == 3 and bool(own.counts()))
@@ -211,12 +216,16 @@ def test_the_button_of_rviz_sets_the_pose(changes: tuple[tuple[str, str], ...]) 
         assert "initialpose" not in "".join(own.bridge.findings)  # nobody need publish it
 
 
-def test_static_transforms_that_came_before_the_bridge_count() -> None:
+@pytest.mark.parametrize("changes", [(), BEHIND_DDS])
+def test_static_transforms_that_came_before_the_bridge_count(
+    changes: tuple[tuple[str, str], ...],
+) -> None:
     places = {"transforms": [static("base_link", "camera", (0.4, 0.0, 0.3), OPTICAL)]}
-    team = lab(("[robots.r2]", '[robots.r2]\nros2 = { map_frame = "r2/map" }'))
+    team = lab(("[robots.r2]", '[robots.r2]\nros2 = { map_frame = "r2/map" }'), *changes)
     endpoint = free_endpoint()
     assert team.ros2 is not None
-    settings = NodeSettings(connect=(endpoint,), name="robots")
+    ours = node_settings(team.ros2, [endpoint])
+    settings = NodeSettings(connect=(endpoint,), name="robots", layout=ours.layout)
     with (
         open_router(team.name, [endpoint]),
         open_bus(team.name, [endpoint]) as bus,
@@ -225,7 +234,7 @@ def test_static_transforms_that_came_before_the_bridge_count() -> None:
         robots.publisher("r1/tf_static", types.TRANSFORMS, LATCHED).publish(
             message(types.TRANSFORMS, **places)
         )
-        with open_node(node_settings(team.ros2, [endpoint])) as node:
+        with open_node(ours) as node:
             bridge = TeamBridge(team, list(team.robots), node, bus, time.time_ns)
             heard: list[Received] = []
             robots.subscribe("r2/tf_static", types.TRANSFORMS, heard.append, STATIC_TRANSFORMS)
