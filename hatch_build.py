@@ -23,6 +23,7 @@ HOT = (
     "landmarks",
     "localizer",
     "map_rejections",
+    "map_residuals",
     "miscalibration",
     "motion",
     "object_timers",

@@ -8,7 +8,6 @@ An error of a scale is the share by which a reading is too small; the bias is wh
 large by (rad).
 """
 
-import math
 from math import sqrt
 from typing import Final, NamedTuple
 
@@ -24,10 +23,10 @@ INSENSITIVE: Matrix3 = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 """The sensitivity of a pose is its error for an error of one in each of the three (columns)."""
 
 
-def sensitivity_after(v: Matrix3, distance: float, turn: float, course: float) -> Matrix3:
-    """The sensitivity after a block that drives `distance` (m) on the `course` (rad, in the field's
-    frame) and turns by `turn` (rad)."""
-    lx, ly = -distance * math.sin(course), distance * math.cos(course)
+def sensitivity_after(v: Matrix3, dx: float, dy: float, turn: float) -> Matrix3:
+    """The sensitivity after an arc that leads by (dx, dy) (m) in the field's frame and turns by
+    `turn` (rad)."""
+    lx, ly = -dy, dx
     xd, xt, xb, yd, yt, yb, hd, ht, hb = v
     xd, xt, xb = xd + lx * hd + ly, xt + lx * (ht + 0.5 * turn), xb + lx * (hb + 1.0)
     yd, yt, yb = yd + ly * hd - lx, yt + ly * (ht + 0.5 * turn), yb + ly * (hb + 1.0)

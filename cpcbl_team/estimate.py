@@ -59,14 +59,15 @@ class Covariance3(NamedTuple):
         a, b, c = yy * hh - yh * yh, xh * yh - xy * hh, xy * yh - xh * yy
         k = 1.0 / (xx * a + xy * b + xh * c)
         d, e, f = xx * hh - xh * xh, xy * xh - xx * yh, xx * yy - xy * xy
-        return Covariance3(k * a, k * b, k * d, k * c, k * e, k * f)
+        return new(Covariance3, (k * a, k * b, k * d, k * c, k * e, k * f))
 
     def transformed(self, m: Matrix3) -> "Covariance3":
         """M C M^T."""
         a, b, c, d, e, f, g, h, i = m
-        ax, ay, ah = self.times((a, b, c))
-        dx, dy, dh = self.times((d, e, f))
-        gx, gy, gh = self.times((g, h, i))
+        xx, xy, yy, xh, yh, hh = self
+        ax, ay, ah = xx * a + xy * b + xh * c, xy * a + yy * b + yh * c, xh * a + yh * b + hh * c
+        dx, dy, dh = xx * d + xy * e + xh * f, xy * d + yy * e + yh * f, xh * d + yh * e + hh * f
+        gx, gy, gh = xx * g + xy * h + xh * i, xy * g + yy * h + yh * i, xh * g + yh * h + hh * i
         product = (
             a * ax + b * ay + c * ah,
             d * ax + e * ay + f * ah,

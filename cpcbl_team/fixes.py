@@ -108,7 +108,8 @@ def unbiased_range_m(
     over the plane. (Lerro & Bar-Shalom, Tracking with debiased consistent converted measurements,
     IEEE Transactions on Aerospace and Electronic Systems, 1993, for the first of them.)
     """
-    share = (range_sigma_m / range_m) ** 2 + 2.0 * share_of_reading * share_of_reading
+    ratio = min(range_sigma_m / range_m, 1.0 / MOST_SHIFT)  # whose square is beyond anyway
+    share = ratio**2 + 2.0 * share_of_reading * share_of_reading
     return range_m * (1.0 + min(share, MOST_SHIFT)) * math.exp(-0.5 * bearing_sigma**2)
 
 

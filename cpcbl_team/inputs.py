@@ -79,6 +79,20 @@ class Position(msgspec.Struct, frozen=True, array_like=True, tag="position"):
     covariance: tuple[float, float, float]
 
 
+class InitialPose(msgspec.Struct, frozen=True, array_like=True, tag="initial_pose"):
+    """Where the robot is in the field's frame, as a person or a program says. It replaces what the
+    robot believed until then.
+
+    `covariance` is xx, xy, yy, xh, yh, hh (m^2, m rad, rad^2).
+    """
+
+    stamp_ns: int
+    x_m: float
+    y_m: float
+    heading_rad: float
+    covariance: tuple[float, float, float, float, float, float]
+
+
 class Belief(msgspec.Struct, frozen=True, array_like=True, tag="belief"):
     """A robot's estimate in the field's frame, for passive collaboration.
 
@@ -136,4 +150,4 @@ class InputsMended(msgspec.Struct, frozen=True, array_like=True, tag="mended"):
     position_sigma_m: float = 0.0
 
 
-Input = Odometry | Sightings | Position | Belief | Fix | BeliefShared | InputsMended
+Input = Odometry | Sightings | Position | InitialPose | Belief | Fix | BeliefShared | InputsMended

@@ -7,6 +7,7 @@ with faults) are left to `measurements.py`. `tests/core/test_landmarks.py` compa
 """
 
 import math
+from collections.abc import Sequence
 from math import sqrt
 from typing import Final
 
@@ -34,9 +35,10 @@ from cpcbl_team.estimate import (
 )
 from cpcbl_team.fusion import chi_square
 from cpcbl_team.gaussian import width_per_m
-from cpcbl_team.geometry import new, wrap_angle
+from cpcbl_team.geometry import Pose2, new, wrap_angle
 from cpcbl_team.inputs import Sighting
 from cpcbl_team.miscalibration import AS_CONFIGURED, Adaptation
+from cpcbl_team.range_errors import SeenLandmark
 from cpcbl_team.sensors import (
     LARGEST_BEARING_RAD,
     LARGEST_M,
@@ -58,6 +60,17 @@ class Mark:
         self.x, self.y = x, y
         self.gives_range = gives in ("both", "range")
         self.gives_bearing = gives in ("both", "bearing")
+
+
+class Reading:
+    """What a landmark was seen with, as far as it is used: range (m), bearing (rad), and the
+    variance (m^2) of the range."""
+
+    def __init__(
+        self, name: str, mark: Mark, range_m: float | None, bearing: float | None, variance: float
+    ) -> None:
+        self.name, self.x, self.y = name, mark.x, mark.y
+        self.range_m, self.bearing, self.variance = range_m, bearing, variance
 
 
 class LandmarkUpdate:
@@ -128,7 +141,7 @@ class Landmarks:
         uses_bearing = scope is not None and (scope is not POSITION or self._uses_rays)
         for sighting in sightings:
             mark = marks.get(sighting.id)
-            if mark is None:
+            if mark is None:  # a teammate, whose sighting may have more numbers
                 update.others.append(sighting)
                 continue
             numbers: Numbers = _astuple(sighting)
@@ -231,26 +244,14 @@ class Landmarks:
         _, _, bias, _, factor, ranges = adaptation
         scale, offset_m, k = ranges.scale, ranges.offset_m, sqrt(factor)
         bearing_sigma = k * self._bearing_sigma_rad
-        pose_x, pose_y, _ = pose
-        first: dict[str, Sighting] = {}
-        for sighting in sightings:
-            first.setdefault(sighting.id, sighting)
         pieces = []
-        for name, sighting in first.items():
-            mark, sigma_m = self._marks[name], 0.0
-            numbers: Numbers = _astuple(sighting)
-            range_m, bearing = numbers[1], numbers[2]
-            if not mark.gives_range or range_m is None or range_m > self._farthest_m:
-                range_m = None
-            else:
-                distance = _hypot(mark.x - pose_x, mark.y - pose_y)
-                sigma_m = k * sqrt(self._range_variance(distance, range_m))
+        for reading in self._readings(sightings, pose):
+            name, x, y, sigma_m = reading.name, reading.x, reading.y, k * sqrt(reading.variance)
+            range_m, bearing = reading.range_m, reading.bearing
+            if range_m is not None:
                 range_m = scale * range_m + offset_m
-            if not mark.gives_bearing:
-                bearing = None
-            elif bearing is not None and bias != 0.0:
+            if bearing is not None and bias != 0.0:
                 bearing = wrap_angle(bearing - bias)
-            x, y = mark.x, mark.y
             # The last four are of teammates. (With a star a compiled tuple is made of a list.)
             piece = (
                 stamp_ns, place, name, x, y, range_m, bearing, sigma_m, bearing_sigma,
@@ -258,6 +259,37 @@ class Landmarks:
             )  # fmt: skip
             pieces.append(new(Evidence, piece))
         return pieces
+
+    def seen_landmarks(self, snapshot: LandmarkSnapshot) -> list[SeenLandmark]:
+        """The landmarks of a snapshot that were seen with range and bearing."""
+        _, _, pose, sightings = snapshot
+        sigma, found = self._bearing_sigma_rad, []
+        for r in self._readings(sightings, pose):
+            if r.range_m is not None and r.bearing is not None:
+                seen = SeenLandmark(r.name, r.x, r.y, r.range_m, r.bearing, r.variance, sigma)
+                found.append(seen)
+        return found
+
+    def _readings(self, sightings: Sequence[Sighting], pose: Pose2) -> list[Reading]:
+        """What each landmark of a snapshot was seen with first, as far as it is used."""
+        pose_x, pose_y, _ = pose
+        readings: list[Reading] = []
+        names: set[str] = set()
+        for sighting in sightings:
+            numbers: Numbers = _astuple(sighting)
+            name, range_m, bearing, _, _, _, _ = numbers
+            if name in names:
+                continue
+            names.add(name)
+            mark, variance = self._marks[name], 0.0
+            if not mark.gives_range or range_m is None or range_m > self._farthest_m:
+                range_m = None
+            else:
+                distance = _hypot(mark.x - pose_x, mark.y - pose_y)
+                variance = self._range_variance(distance, range_m)
+            bearing = bearing if mark.gives_bearing else None
+            readings.append(Reading(name, mark, range_m, bearing, variance))
+        return readings
 
 
 def _curved_weight(weight: float, prior: Covariance3, row: Row, curvature: float) -> float:

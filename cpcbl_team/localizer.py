@@ -18,6 +18,7 @@ from cpcbl_team.inputs import (
     Belief,
     BeliefShared,
     Fix,
+    InitialPose,
     InputsMended,
     Odometry,
     Position,
@@ -109,8 +110,9 @@ class Localizer:
         state, scope, landmarks, others = self.measure(state, frame)  # 2. measurements
         if scope is None:  # nothing may be updated
             return self.recovery.check(state)
-        common = state.common_errors
-        gated = self.constrain(state.estimate, others, scope, common) if others else _NO_OBJECTS
+        gated = _NO_OBJECTS
+        if others:
+            gated = self.constrain(state.estimate, others, scope, state.common_errors)
         if self.screen.has_recent_reports(state, now):  # beyond the paper: trust
             state, gated = self.screen.screen_frame(state, landmarks, gated)
         if self._camera is None:
@@ -357,6 +359,11 @@ class Localizer:
         return state if self._camera is None else self._camera.started(state)
 
     # The start --------------------------------------------------------------------------------
+
+    def set_pose(self, state: State, given: InitialPose) -> State:
+        """Somebody says where the robot is: nothing is left of what it believed."""
+        state = self.predict(state, given.stamp_ns)
+        return self.recovery.check(self.recovery.with_given_pose(state, given))
 
     def start(self, stamp_ns: int) -> State:
         """The state at the start: at the configured pose, or lost somewhere on the field."""

@@ -17,6 +17,7 @@ Only what the robot measures itself counts: a teammate's reports cannot change h
 
 import math
 from collections.abc import Sequence
+from math import cos, sin, sqrt
 from typing import Final, NamedTuple
 
 from cpcbl_team.config import OdometryNoise
@@ -39,13 +40,15 @@ from cpcbl_team.estimate import (
     Estimate,
     Matrix3,
     Row,
+    Six,
 )
 from cpcbl_team.geometry import Pose2, new, wrap_angle
-from cpcbl_team.motion import move
+from cpcbl_team.motion import covariance_after, distance_variance, turn_variance
 from cpcbl_team.range_errors import NO_RANGE_ERRORS, RangeErrors
 
+_atan2: Final = math.atan2  # see `constraints._atan2`
 BLOCK_NS: Final = 1_500_000_000
-STEP_NS: Final = 300_000_000
+STEP_NS: Final = 375_000_000  # an arc of a block's path
 LONGEST_NS: Final = 5_000_000_000
 MOST_TURN_RAD: Final = 2.5  # beyond, the chord of a block is much shorter than its path
 LEAST_DISTANCE_M: Final = 0.02
@@ -95,48 +98,33 @@ class ModelCheck(NamedTuple):
     rejected: str = ""  # the last of which is this one,
     accepted: int = 0  # since so many observations were accepted
     doubts: Row = NO_ERRORS  # variances of constant errors that the settings may still have
-    ahead: Corrected | None = None
-    """Where the odometry alone has led since the block began."""
+    path: tuple[Pose2, ...] = ()
+    """Where the odometry has led since the block began, one pose each 0.375 s."""
+    path_ns: int = 0  # the time of the last one, or of the block's begin
 
     def restarted(self, accepted: int) -> "ModelCheck":
         """For a robot that was lost: what it rejected then tells nothing."""
-        return self._replace(begin=None, ahead=None, rejections=0, accepted=accepted)
+        return self._replace(begin=None, path=(), rejections=0, accepted=accepted)
 
     def from_pose(self, now: Corrected) -> "ModelCheck":
         """With a block that begins now, after one that tells nothing."""
-        return self.with_block(now, now, INSENSITIVE, self.evidence)
+        return self.with_block(now, INSENSITIVE, self.evidence)
 
-    def with_step(self, stamp_ns: int, place_now: Pose2, noise: OdometryNoise) -> "ModelCheck":
-        """With the odometry until now, as one arc. A block has several: how a turn's noise moves
-        the position depends on the path."""
-        begin, sensitivity, evidence, _, _, _, _, ahead = self
-        ahead = ahead or begin
-        assert ahead is not None
-        _, estimate, place, gaps = ahead  # unpacked one by one: that is fast when compiled
-        pose, covariance, _ = estimate
-        pose_x, pose_y, pose_h = pose
-        place_x, place_y, place_h = place
-        now_x, now_y, now_h = place_now
-        x, y = now_x - place_x, now_y - place_y
-        distance, turn = math.sqrt(x * x + y * y), wrap_angle(now_h - place_h)
-        course = math.atan2(y, x) - place_h + pose_h
-        start = new(Pose2, (pose_x, pose_y, course - 0.5 * turn))
-        moved, due, _ = move(new(Estimate, (start, covariance, ZERO3)), distance, turn, noise)
-        pose = new(Pose2, (moved[0], moved[1], wrap_angle(pose_h + turn)))
-        here = new(Corrected, (stamp_ns, new(Estimate, (pose, due, ZERO3)), place_now, gaps))
-        sensitivity = sensitivity_after(sensitivity, distance, turn, course)
-        return self.with_block(begin, here, sensitivity, evidence)
+    def with_place(self, stamp_ns: int, place: Pose2) -> "ModelCheck":
+        """With where the odometry has led until now. A block has several arcs: how a turn's noise
+        moves the position depends on the path."""
+        begin, sensitivity, evidence, number, last, accepted, doubts, path, _ = self
+        path = (*path, place)
+        check = begin, sensitivity, evidence, number, last, accepted, doubts, path, stamp_ns
+        return new(ModelCheck, check)
 
     def with_block(
-        self,
-        begin: Corrected | None,
-        ahead: Corrected | None,
-        sensitivity: Matrix3,
-        evidence: Evidence,
+        self, begin: Corrected, sensitivity: Matrix3, evidence: Evidence
     ) -> "ModelCheck":
-        """With another block. (`_replace` would take as long as the rest of a step.)"""
-        _, _, _, number, last, accepted, doubts, _ = self
-        check = begin, sensitivity, evidence, number, last, accepted, doubts, ahead
+        """With another block. (`_replace` would take as long as the rest of it.)"""
+        _, _, _, number, last, accepted, doubts, _, _ = self
+        stamp_ns, _, _, _ = begin
+        check = begin, sensitivity, evidence, number, last, accepted, doubts, (), stamp_ns
         return new(ModelCheck, check)
 
     def with_rejections(self, names: Sequence[str]) -> "ModelCheck":
@@ -160,6 +148,32 @@ class Adaptation(NamedTuple):
 AS_CONFIGURED: Final = Adaptation()
 
 
+def after_path(
+    begin: Corrected, check: ModelCheck, place_now: Pose2, noise: OdometryNoise
+) -> tuple[Estimate, Matrix3]:
+    """The estimate and the sensitivity at the end of a block by its odometry alone."""
+    _, (pose, covariance, _), place, _ = begin
+    sensitivity, path = check.sensitivity, check.path
+    x, y, heading = pose
+    place_x, place_y, place_h = place
+    left: Six = covariance
+    for place_after in [*path, place_now]:
+        after_x, after_y, after_h = place_after
+        east, north = after_x - place_x, after_y - place_y
+        distance, turn = sqrt(east * east + north * north), wrap_angle(after_h - place_h)
+        c, s = cos(heading - place_h), sin(heading - place_h)
+        dx, dy = c * east - s * north, s * east + c * north  # in the field's frame
+        if distance > 0.0:
+            c, s = dx / distance, dy / distance
+        along = distance_variance(distance, turn, noise, 0.0)
+        left = covariance_after(left, distance, c, s, along, turn_variance(distance, turn, noise))
+        sensitivity = sensitivity_after(sensitivity, dx, dy, turn)
+        x, y, heading = x + dx, y + dy, wrap_angle(heading + turn)
+        place_x, place_y, place_h = after_x, after_y, after_h
+    parts = new(Pose2, (x, y, heading)), new(Covariance3, left), ZERO3
+    return new(Estimate, parts), sensitivity
+
+
 def check_models(check: ModelCheck, now: Corrected, noise: OdometryNoise) -> ModelCheck:
     """The check after the block that ends now; the next one begins.
 
@@ -177,15 +191,13 @@ def check_models(check: ModelCheck, now: Corrected, noise: OdometryNoise) -> Mod
     if abs(turn) > MOST_TURN_RAD:
         return check.from_pose(now)
     if x * x + y * y < LEAST_DISTANCE_M**2 and abs(turn) < LEAST_TURN_RAD:
-        return check.with_block(now, now, check.sensitivity, check.evidence)
-    check = check.with_step(now.stamp_ns, place_now, noise)
-    assert check.ahead is not None
-    (predicted, due, _), sensitivity = check.ahead.estimate, check.sensitivity
+        return check.with_block(now, check.sensitivity, check.evidence)
+    (predicted, due, _), sensitivity = after_path(begin, check, place_now, noise)
     if due.determinant() <= SMALLEST_VARIANCE**3:
         return check.from_pose(now)
     taken, added = due.plus(left, -1.0), due.plus(before, -1.0)
-    course = math.atan2(y, x) - place.heading + pose.heading
-    c, s = math.cos(course), math.sin(course)
+    course = _atan2(y, x) - place.heading + pose.heading
+    c, s = cos(course), sin(course)
     to_course = c, s, 0.0, -s, c, 0.0, 0.0, 0.0, 1.0
     dx, dy = pose_now.x - predicted.x, pose_now.y - predicted.y
     correction = c * dx + s * dy, c * dy - s * dx, wrap_angle(pose_now.heading - predicted.heading)
@@ -198,7 +210,7 @@ def check_models(check: ModelCheck, now: Corrected, noise: OdometryNoise) -> Mod
         added.transformed(to_course),
     )
     evidence = check.evidence.plus(whitened)
-    return check.with_block(now, now, difference(sensitivity, corrected), evidence)
+    return check.with_block(now, difference(sensitivity, corrected), evidence)
 
 
 class Rules(NamedTuple):

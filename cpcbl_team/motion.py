@@ -11,7 +11,7 @@ from typing import Final, NamedTuple
 import msgspec
 
 from cpcbl_team.config import OdometryNoise, OdometrySettings
-from cpcbl_team.estimate import ZERO3, Covariance3, Estimate, Matrix3, circle_variance
+from cpcbl_team.estimate import ZERO3, Covariance3, Estimate, Matrix3, Six, circle_variance
 from cpcbl_team.geometry import Pose2, new, wrap_angle
 from cpcbl_team.inputs import Odometry
 
@@ -59,6 +59,23 @@ def turn_variance(distance: float, turn: float, noise: OdometryNoise) -> float:
     return per_m * per_m * abs(distance) + per_rad * per_rad * abs(turn)
 
 
+def covariance_after(
+    covariance: Six, distance: float, c: float, s: float, along: float, around: float
+) -> Six:
+    """The covariance after an arc of `distance` metres in the direction (c, s), with these
+    variances of its length and its turn: F P F^T + C, written out, for every step needs it."""
+    xx, xy, yy, xh, yh, hh = covariance
+    # where a heading error of one radian leads, in metres: the last column of F
+    lx, ly = -distance * s, distance * c
+    # where a turn error leads: half of it; and its covariance with the position
+    wx, wy = 0.5 * around * lx, 0.5 * around * ly
+    nxh, nyh = xh + lx * hh, yh + ly * hh
+    xx += lx * (xh + nxh + 0.5 * wx) + along * c * c
+    xy += lx * yh + ly * nxh + 0.5 * lx * wy + along * c * s
+    yy += ly * (yh + nyh + 0.5 * wy) + along * s * s
+    return xx, xy, yy, nxh + wx, nyh + wy, hh + around
+
+
 def move(
     estimate: Estimate,
     distance: float,
@@ -70,26 +87,18 @@ def move(
 ) -> Estimate:
     """The estimate after odometry reports an arc of `distance` metres that turns by `turn`.
 
-    F P F^T + C is written out, for it runs for every odometry step. For `crawl_s` seconds of it
-    the robot drove at its least speed; `extra` is of odometry that was lost. `as_circle`: the
-    position's covariance is kept as a circle.
+    For `crawl_s` seconds of it the robot drove at its least speed; `extra` is of odometry that was
+    lost. `as_circle`: the position's covariance is kept as a circle.
     """
     pose, covariance, shared = estimate
     x, y, heading = pose
-    xx, xy, yy, xh, yh, hh = covariance
+    extra_distance, extra_turn = extra
     direction = heading + 0.5 * turn
     c, s = cos(direction), sin(direction)
-    along = distance_variance(distance, turn, noise, crawl_s) + extra[0]
-    around = turn_variance(distance, turn, noise) + extra[1]
-    # where a heading error of one radian leads, in metres: the last column of F
+    along = distance_variance(distance, turn, noise, crawl_s) + extra_distance
+    around = turn_variance(distance, turn, noise) + extra_turn
     lx, ly = -distance * s, distance * c
-    # where a turn error leads: half of it; and its covariance with the position
-    wx, wy = 0.5 * around * lx, 0.5 * around * ly
-    nxh, nyh = xh + lx * hh, yh + ly * hh
-    xx += lx * (xh + nxh + 0.5 * wx) + along * c * c
-    xy += lx * yh + ly * nxh + 0.5 * lx * wy + along * c * s
-    yy += ly * (yh + nyh + 0.5 * wy) + along * s * s
-    xh, yh, hh = nxh + wx, nyh + wy, hh + around
+    xx, xy, yy, xh, yh, hh = covariance_after(covariance, distance, c, s, along, around)
     if as_circle:
         xx = yy = circle_variance(xx, xy, yy)
         xy = 0.0
@@ -163,9 +172,9 @@ def inflate_by_gap(
     estimate: Estimate, gap_ns: int, before: Odometry | None, gap_speed_m_s: float
 ) -> Estimate:
     """The estimate after a long time without odometry: a random walk. In one second it leads as far
-    as `gap_speed_m_s` and the last speed do, each for a second."""
-    speed, rate = (0.0, 0.0) if before is None else _speeds(before)
-    seconds, least = gap_ns * 1e-9, gap_speed_m_s * gap_speed_m_s
-    p, h = (least + speed * speed) * seconds, (least + rate * rate) * seconds
-    growth = Covariance3(p, 0.0, p, 0.0, 0.0, h)
-    return estimate._replace(covariance=estimate.covariance.plus(growth))
+    as `gap_speed_m_s` and the last speed do, each for a second; a robot that drove may turn since
+    then, and one that turned may drive, so the larger of both speeds (m/s, rad/s) counts."""
+    fastest = 0.0 if before is None else max(map(abs, _speeds(before)))
+    growth = (gap_speed_m_s**2 + fastest**2) * gap_ns * 1e-9
+    added = Covariance3(growth, 0.0, growth, 0.0, 0.0, growth)
+    return estimate._replace(covariance=estimate.covariance.plus(added))

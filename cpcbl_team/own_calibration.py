@@ -4,6 +4,7 @@ A robot that calibrates itself (`self_calibration.py`) learns scales and a bias 
 other one changes its settings only where they are wrong (`miscalibration.py`).
 """
 
+import math
 from collections.abc import Iterable, Sequence
 
 from cpcbl_team.config import Field, LocalizationSettings, OdometryNoise
@@ -11,10 +12,12 @@ from cpcbl_team.constant_errors import NO_ERRORS, NO_EVIDENCE, pose_offset
 from cpcbl_team.estimate import POSE, offset_pose
 from cpcbl_team.geometry import new
 from cpcbl_team.landmarks import Landmarks, LandmarkUpdate
+from cpcbl_team.map_residuals import Reading
 from cpcbl_team.measurements import GatedObject
 from cpcbl_team.miscalibration import (
     AS_CONFIGURED,
     BLOCK_NS,
+    LEAST_DISTANCE_M,
     LEAST_PARTS,
     STEP_NS,
     Adaptation,
@@ -28,10 +31,10 @@ from cpcbl_team.miscalibration import (
     noise_with_factor,
 )
 from cpcbl_team.motion import NO_VARIANCE, MotionVariance, distance_variance, turn_variance
-from cpcbl_team.range_errors import NO_RANGE_ERRORS, RangeErrors, Seen
+from cpcbl_team.range_errors import NO_RANGE_ERRORS, RangeErrors, SeenLandmark
 from cpcbl_team.recovery_evidence import SPACING_NS
 from cpcbl_team.self_calibration import ReferencePose, ReferencePoses, self_calibrate
-from cpcbl_team.state import CalibrationMemory, Evidence, Memory, RecoveryMemory, State, with_memory
+from cpcbl_team.state import CalibrationMemory, Memory, RecoveryMemory, State, with_memory
 
 
 class OwnCalibration:
@@ -47,6 +50,7 @@ class OwnCalibration:
         )
         # Of two that contradict each other either one may be wrong
         self._names_misplaced = len(field.landmarks) + len(field.walls) > 2
+        self._names_of_landmarks = frozenset(field.landmarks)
         block_s = BLOCK_NS * 1e-9
         correlation_s, spacing_s = settings.sensor.correlation_s, SPACING_NS * 1e-9
         self._rules = Rules(
@@ -106,17 +110,16 @@ class OwnCalibration:
             return self._after_learning(state)
         if not self._is_checked:
             return state
-        memory, now_ns = state.memory.calibration, state.stamp_ns
-        if memory.common is not None and not memory.common.is_precise:
+        now_ns, _, place, _, _, _, memory = state
+        _, _, calibration, _ = memory
+        _, _, _, check, present, _, _, common, _ = calibration
+        if common is not None and not common.is_precise:
             return state  # corrections of the pose tell of the camera
-        check = memory.check
-        begin, ahead = check.begin, check.ahead
-        if begin is None or ahead is None or now_ns - begin.stamp_ns >= BLOCK_NS:
-            return self._after_check(self._with_ranges(state))
-        if now_ns - ahead.stamp_ns >= STEP_NS:
-            noise = noise_with_factor(self._noise, memory.adaptation.motion_factor)
-            check = check.with_step(now_ns, state.odometry_from_robot, noise)
-            return self._with_check(state, check, memory.adaptation)
+        begin, _, _, _, _, _, _, _, path_ns = check
+        if begin is None or now_ns - begin.stamp_ns >= BLOCK_NS:
+            return self._after_check(self._with_ranges(self._with_residuals(state)))
+        if now_ns - path_ns >= STEP_NS:
+            return self._with_check(state, check.with_place(now_ns, place), present)
         return state
 
     def without_adaptation(self, state: State) -> State:
@@ -125,15 +128,37 @@ class OwnCalibration:
         known = CalibrationMemory(memory.learned, memory.references, memory.total_turn_rad, check)
         return _with_calibration(state, known._replace(common=memory.common))
 
+    def _with_residuals(self, state: State) -> State:
+        """The state that has compared what it read of landmarks with the map, once a block in which
+        it has moved: from one place any of them may be the wrong one."""
+        memory, recovery, place = state.memory.calibration, state.memory.recovery, state[2]
+        begin = memory.check.begin
+        if not self._names_misplaced or begin is None or recovery.lost:
+            return state
+        moved = place.x - begin.odometry_from_robot.x, place.y - begin.odometry_from_robot.y
+        if math.hypot(*moved) < LEAST_DISTANCE_M:
+            return state
+        field_from_odometry = state.estimate.pose @ place.inverse()
+        pieces = [e for e in recovery.evidence if not e.from_teammate]
+        for snapshot in recovery.snapshots:
+            if snapshot[0] > begin.stamp_ns:
+                pieces += self._landmarks.evidence_of(snapshot, memory.adaptation)
+        readings, k = [], 1.0 / math.sqrt(self._independent_frames)
+        for e in pieces:
+            if e.stamp_ns > begin.stamp_ns and e.source in self._names_of_landmarks:
+                x, y, heading = field_from_odometry @ e.odometry_from_robot
+                seen = e.range_m, e.bearing_rad, k * e.range_sigma_m, k * e.bearing_sigma_rad
+                readings.append(Reading(e.source, e.x - x, e.y - y, heading, *seen))
+        return _with_calibration(state, memory._replace(residuals=memory.residuals.plus(readings)))
+
     def _with_ranges(self, state: State) -> State:
         """The state that has compared distances between landmarks with the map, once a block."""
         memory, recovery = state.memory.calibration, state.memory.recovery
         if memory.check.begin is None or recovery.lost:
             return state
-        ranges = memory.ranges
         present = memory.adaptation
-        for frame in self._frames_since(recovery, memory.check.begin.stamp_ns, present.ranges):
-            ranges = ranges.plus(frame)
+        frames = self._frames_since(recovery, memory.check.begin.stamp_ns, present.ranges)
+        ranges = memory.ranges.plus(frames)
         errors = ranges.errors(present.ranges, self._independent_frames)
         if errors != present.ranges:
             if present.ranges == NO_RANGE_ERRORS:
@@ -145,21 +170,19 @@ class OwnCalibration:
 
     def _frames_since(
         self, recovery: RecoveryMemory, since_ns: int, present: RangeErrors
-    ) -> Iterable[list[Seen]]:
+    ) -> Iterable[list[SeenLandmark]]:
         """The landmarks that were seen with range and bearing after this time, by frames."""
-        pieces: list[Evidence] = []
+        frames: dict[int, list[SeenLandmark]] = {}
         for e in recovery.evidence:
-            if e.stamp_ns > since_ns and not e.from_teammate and e.range_m is not None:
-                read_m = (e.range_m - present.offset_m) / present.scale  # these are corrected
-                pieces.append(e._replace(range_m=read_m))
+            stamp_ns, _, name, x, y, range_m, bearing, sigma_m, sigma_rad, _, of_teammate, _, _ = e
+            if stamp_ns <= since_ns or of_teammate or range_m is None or bearing is None:
+                continue
+            read_m = (range_m - present.offset_m) / present.scale  # these are corrected
+            seen = SeenLandmark(name, x, y, read_m, bearing, sigma_m * sigma_m, sigma_rad)
+            frames.setdefault(stamp_ns, []).append(seen)
         for snapshot in recovery.snapshots:
             if snapshot[0] > since_ns:
-                pieces += self._landmarks.evidence_of(snapshot)
-        frames: dict[int, list[Seen]] = {}
-        for stamp_ns, _, name, x, y, range_m, bearing, sigma_m, sigma_rad, _, _, _, _ in pieces:
-            if range_m is not None and bearing is not None:
-                seen = new(Seen, (name, x, y, range_m, bearing, sigma_m, sigma_rad))
-                frames.setdefault(stamp_ns, []).append(seen)
+                frames.setdefault(snapshot[0], []).extend(self._landmarks.seen_landmarks(snapshot))
         return frames.values()
 
     def _after_learning(self, state: State) -> State:
@@ -211,13 +234,15 @@ class OwnCalibration:
         evidence = NO_EVIDENCE
         if errors != NO_ERRORS:
             evidence = check.evidence.without(errors)
-        check = ModelCheck(now, check.sensitivity, evidence, 0, "", accepted, doubts, now)
+        check = ModelCheck(
+            now, check.sensitivity, evidence, 0, "", accepted, doubts, (), now.stamp_ns
+        )
         return self._with_check(state.counted("miscalibrated"), check, changed)
 
     def _with_check(self, state: State, check: ModelCheck, present: Adaptation) -> State:
         memory = state.memory.calibration
-        learned, references, total_turn_rad, _, _, rejections, ranges, common = memory
-        parts = learned, references, total_turn_rad, check, present, rejections, ranges, common
+        learned, references, total_turn_rad, _, _, *others = memory
+        parts = learned, references, total_turn_rad, check, present, *others
         return _with_calibration(state, new(CalibrationMemory, parts))
 
 

@@ -6,8 +6,9 @@ from cpcbl_team.geometry import step
 from cpcbl_team.inputs import Odometry
 from cpcbl_team.motion import NO_VARIANCE, bridge, inflate_by_gap, is_gap, part_of_piece
 from cpcbl_team.own_calibration import OwnCalibration
+from cpcbl_team.recovery_evidence import without_evidence
 from cpcbl_team.sensors import time_at_min_speed_s
-from cpcbl_team.state import State, with_motion, with_odometry
+from cpcbl_team.state import State, with_motion, with_odometry, with_recovery
 from cpcbl_team.variants import JointVariant
 
 
@@ -89,4 +90,6 @@ class Prediction:
         silent_ns = min(gap_ns - self._odometry_timeout_ns, until_ns - from_ns)
         if silent_ns > 0:
             estimate = inflate_by_gap(estimate, silent_ns, before, self._odometry.gap_speed_m_s)
+            if before is not None and (before.distance_m or before.turn_rad):
+                state = with_recovery(state, without_evidence(state.memory.recovery))
         return with_motion(state, until_ns, estimate, place)

@@ -11,14 +11,11 @@ Measurement Error Models, 1987; the earlier frame is the instrument). So is whet
 linear enough to be used: chosen by their own noise, distances would be too short.
 """
 
-import math
-from collections.abc import Mapping, Sequence
-from math import cos, sin
+from collections.abc import Iterable, Mapping, Sequence
+from math import cos, sin, sqrt
 from typing import Final, NamedTuple
 
 from cpcbl_team.geometry import new
-
-_hypot: Final = math.hypot  # see `constraints._atan2`
 
 FADING: Final = 1.0 - 1.0 / 500.0  # of all sums, a frame
 PRIOR_SHARE: Final = 0.05  # sigmas; the two errors look alike, and each takes its part. Wider ones
@@ -32,18 +29,6 @@ SIGMAS_OF_REST: Final = 2.5  # and without any one of the objects
 LEAST: Final = 0.03  # of a range: what the first change must be,
 LEAST_AGAIN: Final = 0.005  # and others
 MOST: Final = 0.3
-
-
-class Seen(NamedTuple):
-    """A landmark as it was seen; the sensor's sigmas."""
-
-    name: str
-    x: float  # on the map, m
-    y: float
-    range_m: float
-    bearing_rad: float
-    range_sigma_m: float
-    bearing_sigma_rad: float
 
 
 class RangeErrors(NamedTuple):
@@ -65,61 +50,42 @@ class RangeErrors(NamedTuple):
 NO_RANGE_ERRORS: Final = RangeErrors()
 
 
-class Fit(NamedTuple):
-    """The normal equations of a least-squares fit of both errors."""
-
-    ss: float = 0.0
-    sb: float = 0.0
-    bb: float = 0.0
-    s: float = 0.0
-    b: float = 0.0
-
-    def plus(self, other: "Fit", factor: float = 1.0) -> "Fit":
-        ss, sb, bb, s, b = other
-        parts = (
-            self.ss + factor * ss,
-            self.sb + factor * sb,
-            self.bb + factor * bb,
-            self.s + factor * s,
-            self.b + factor * b,
-        )
-        return new(Fit, parts)
-
-    def explained(self, errors: RangeErrors) -> float:
-        """By how much these errors reduce the sum of squares."""
-        share, bias = errors
-        squared = self.ss * share**2 + 2.0 * self.sb * share * bias + self.bb * bias**2
-        return 2.0 * (self.s * share + self.b * bias) - squared
-
-    def errors(self) -> RangeErrors:
-        """Those that explain most."""
-        ss, bb = self.ss + PRIOR_SHARE**-2, self.bb + PRIOR_BIAS_M**-2
-        k = 1.0 / (ss * bb - self.sb**2)
-        share, bias_m = bb * self.s - self.sb * self.b, ss * self.b - self.sb * self.s
-        return RangeErrors(k * share, k * bias_m)
+Sums = tuple[float, float, float, float, float]
+NO_SUMS: Sums = (0.0, 0.0, 0.0, 0.0, 0.0)
 
 
-class PairGeometry(NamedTuple):
-    """How a pair of landmarks was seen lately: fading means."""
+class SeenLandmark:
+    """A landmark that was seen with range and bearing: its position on the map (m), in the robot's
+    frame (m), and the variances (m^2) of the latter along and across the line of sight."""
 
-    per_bias: float  # what a bias of one metre makes of the distance
-    across: float  # the variance (m^2) of both landmarks across the line between them
+    def __init__(
+        self,
+        name: str,
+        map_x: float,
+        map_y: float,
+        range_m: float,
+        bearing_rad: float,
+        range_variance: float,
+        bearing_sigma_rad: float,
+    ) -> None:
+        self.name, self.map_x, self.map_y, self.range_m = name, map_x, map_y, range_m
+        self.x, self.y = range_m * cos(bearing_rad), range_m * sin(bearing_rad)
+        across_m = range_m * bearing_sigma_rad
+        self.of_range, self.of_bearing = range_variance, across_m * across_m
 
-    def plus(self, last: "PairGeometry") -> "PairGeometry":
-        per_bias, across = self
-        last_bias, last_across = last
-        per_bias += LAST_SHARE * (last_bias - per_bias)
-        across += LAST_SHARE * (last_across - across)
-        return new(PairGeometry, (per_bias, across))
 
+class NormalEquations:
+    """Those of a least-squares fit of both errors: sums that fade with each frame."""
 
-class FadedFit:
-    """Adds up a fit, of which what was known before the present frame fades."""
+    def __init__(self, sums: Sums) -> None:
+        self.ss, self.sb, self.bb, self.s, self.b = sums
 
-    def __init__(self, before: Fit) -> None:
-        ss, sb, bb, s, b = before
-        self.ss, self.sb, self.bb = FADING * ss, FADING * sb, FADING * bb
-        self.s, self.b = FADING * s, FADING * b
+    def sums(self) -> Sums:
+        return self.ss, self.sb, self.bb, self.s, self.b
+
+    def fade(self) -> None:
+        self.ss, self.sb, self.bb = FADING * self.ss, FADING * self.sb, FADING * self.bb
+        self.s, self.b = FADING * self.s, FADING * self.b
 
     def add(self, weight: float, s: float, b: float, error: float) -> None:
         """Adds a distance that is read too short by `error`, of which a share of one makes `s` and
@@ -131,61 +97,45 @@ class FadedFit:
         self.s += ws * error
         self.b += wb * error
 
-    def fit(self) -> Fit:
-        return new(Fit, (self.ss, self.sb, self.bb, self.s, self.b))
+    def explained(self, share: float, bias_m: float) -> float:
+        """By how much these errors reduce the sum of squares."""
+        squared = self.ss * share * share + 2.0 * self.sb * share * bias_m
+        squared += self.bb * bias_m * bias_m
+        return 2.0 * (self.s * share + self.b * bias_m) - squared
+
+    def errors(self) -> tuple[float, float]:
+        """The share and the bias that explain most."""
+        ss, bb = self.ss + PRIOR_SHARE**-2, self.bb + PRIOR_BIAS_M**-2
+        k = 1.0 / (ss * bb - self.sb * self.sb)
+        return k * (bb * self.s - self.sb * self.b), k * (ss * self.b - self.sb * self.s)
+
+    def without(self, part: Sums) -> "NormalEquations":
+        ss, sb, bb, s, b = part
+        return NormalEquations((self.ss - ss, self.sb - sb, self.bb - bb, self.s - s, self.b - b))
 
 
-NO_FIT: Final = Fit()
-NOTHING: Final = (0.0, 0.0, 0.0, 0.0, 0.0)
-_NONE: Final[Mapping[str, Fit]] = {}
-_NO_PAIRS: Final[Mapping[tuple[str, str], PairGeometry]] = {}
+_NONE: Final[Mapping[str, Sums]] = {}
+_NO_PAIRS: Final[Mapping[tuple[str, str], tuple[float, float]]] = {}
 
 
 class RangeEvidence(NamedTuple):
     """The sums of a fit of both errors to distances between landmarks."""
 
-    fit: Fit = Fit()
+    fit: Sums = NO_SUMS
     squares: float = 0.0
     pairs: float = 0.0  # as many as have no landmark in common
-    of_object: Mapping[str, Fit] = _NONE  # of the pairs in which an object is
-    geometry: Mapping[tuple[str, str], PairGeometry] = _NO_PAIRS
-    """Of the pairs of the last frame."""
+    of_object: Mapping[str, Sums] = _NONE  # of the pairs in which an object is
+    geometry: Mapping[tuple[str, str], tuple[float, float]] = _NO_PAIRS
+    """How each pair of the last frame was seen lately, fading means: what a bias of one metre makes
+    of the distance, and the variance (m^2) of both landmarks across the line between them."""
 
-    def plus(self, frame: Sequence[Seen]) -> "RangeEvidence":
-        """With the distances between the landmarks of one frame."""
-        frame = frame[:MOST_OBJECTS]
-        if len(frame) < 2:
-            return self
-        weight = 1.0 / (len(frame) - 1)  # each landmark is in so many pairs
-        fit, squares, pairs, earlier, geometry_before = self
-        total, squares, pairs = FadedFit(fit), FADING * squares, FADING * pairs
-        of_object = {name: FadedFit(fit) for name, fit in earlier.items()}
-        geometry: dict[tuple[str, str], PairGeometry] = {}
-        landmarks = [SeenLandmark(seen) for seen in sorted(frame)]
-        for i, one in enumerate(landmarks):
-            for other in landmarks[i + 1 :]:
-                error, s, variance, b, across = _distance_error(one, other)
-                if variance == 0.0:
-                    continue
-                pair, last = (one.name, other.name), new(PairGeometry, (b, across))
-                before = geometry_before.get(pair)
-                if before is None:
-                    geometry[pair] = last
-                    continue
-                geometry[pair] = before.plus(last)
-                b, across = before
-                if across > CURVED * s * s:
-                    continue
-                w = weight / variance
-                squares, pairs = squares + w * error**2, pairs + weight
-                total.add(w, s, b, error)
-                for name in pair:
-                    of_one = of_object.get(name)
-                    if of_one is None:
-                        of_one = of_object[name] = FadedFit(NO_FIT)
-                    of_one.add(w, s, b, error)
-        fits = {name: one_fit.fit() for name, one_fit in of_object.items()}
-        return new(RangeEvidence, (total.fit(), squares, pairs, fits, geometry))
+    def plus(self, frames: Iterable[Sequence[SeenLandmark]]) -> "RangeEvidence":
+        """With the distances between the landmarks of each of these frames."""
+        sums = RangeSums(self)
+        for frame in frames:
+            if len(frame) > 1:
+                sums.add_frame(sorted(frame[:MOST_OBJECTS], key=_name))
+        return sums.evidence()
 
     def errors(self, present: RangeErrors, independent_share: float) -> RangeErrors:
         """The errors of ranges: none until some are clear, then the best estimate. This share of
@@ -194,36 +144,93 @@ class RangeEvidence(NamedTuple):
         With three landmarks or more they must be clear without any one of them, too, for that one
         may stand elsewhere than on the map.
         """
-        found = self.fit.errors()
-        change = self._change(present, found)
+        sums, squares, pairs, of_object, _ = self
+        fit = NormalEquations(sums)
+        share, bias_m = fit.errors()
+        change = _change(fit, share - present.share, bias_m - present.bias_m)
         if present != NO_RANGE_ERRORS:
-            return found if change > LEAST_AGAIN else present
-        if self.pairs < LEAST_PAIRS or change < LEAST or abs(found.share) > MOST:
+            return RangeErrors(share, bias_m) if change > LEAST_AGAIN else present
+        if pairs < LEAST_PAIRS or change < LEAST or abs(share) > MOST:
             return present
-        unexplained = (self.squares - self.fit.explained(found)) / self.pairs
-        unit = max(unexplained, 1.0) / independent_share  # of a sigma squared
-        rest = [self.fit.plus(fit, -1.0) for fit in self.of_object.values()]
-        is_clear = self.fit.explained(found) > SIGMAS**2 * unit and (
-            len(rest) < 3 or all(fit.explained(found) > SIGMAS_OF_REST**2 * unit for fit in rest)
+        explained = fit.explained(share, bias_m)
+        unit = max((squares - explained) / pairs, 1.0) / independent_share  # of a sigma squared
+        rest = [fit.without(part).explained(share, bias_m) for part in of_object.values()]
+        is_clear = explained > SIGMAS**2 * unit and (
+            len(rest) < 3 or min(rest) > SIGMAS_OF_REST**2 * unit
         )
-        return found if is_clear else present
-
-    def _change(self, present: RangeErrors, found: RangeErrors) -> float:
-        """By which share of it a range changes, of one of half and of one and a half of the usual
-        length the larger."""
-        usual_m = math.sqrt((self.fit.ss + 1.0) / (self.fit.bb + 1.0))
-        share, bias_m = found.share - present.share, found.bias_m - present.bias_m
-        return max(abs(share + bias_m / (k * usual_m)) for k in (0.5, 1.5))
+        return RangeErrors(share, bias_m) if is_clear else present
 
 
-class SeenLandmark:
-    """A landmark in the robot's frame, and the variances (m^2) of where it was seen."""
+def _change(fit: NormalEquations, share: float, bias_m: float) -> float:
+    """By which share of it a range changes with these errors, of one of half and of one and a half
+    of the usual length the larger."""
+    usual_m = sqrt((fit.ss + 1.0) / (fit.bb + 1.0))
+    return max(abs(share + bias_m / (0.5 * usual_m)), abs(share + bias_m / (1.5 * usual_m)))
 
-    def __init__(self, seen: Seen) -> None:
-        name, map_x, map_y, range_m, bearing, range_sigma_m, bearing_sigma = seen
-        self.name, self.map_x, self.map_y, self.range_m = name, map_x, map_y, range_m
-        self.x, self.y = range_m * cos(bearing), range_m * sin(bearing)
-        self.of_range, self.of_bearing = range_sigma_m**2, (range_m * bearing_sigma) ** 2
+
+class RangeSums:
+    """Adds up the distances of more frames; what was known before each of them fades."""
+
+    def __init__(self, before: RangeEvidence) -> None:
+        fit, self._squares, self._pairs, of_object, geometry = before
+        assert isinstance(geometry, dict)  # its methods are fast when compiled
+        self._geometry: dict[tuple[str, str], tuple[float, float]] = geometry
+        self._total = NormalEquations(fit)
+        self._of_object = {name: NormalEquations(sums) for name, sums in of_object.items()}
+
+    def add_frame(self, frame: Sequence[SeenLandmark]) -> None:
+        self._squares, self._pairs = FADING * self._squares, FADING * self._pairs
+        self._total.fade()
+        for equations in self._of_object.values():
+            equations.fade()
+        weight = 1.0 / (len(frame) - 1)  # each landmark is in so many pairs
+        parts = [self._of(seen.name) for seen in frame]
+        before, self._geometry = self._geometry, {}
+        for j, other in enumerate(frame):
+            for i in range(j):
+                self._add_pair(frame[i], other, parts[i], parts[j], weight, before)
+
+    def _add_pair(
+        self,
+        one: SeenLandmark,
+        other: SeenLandmark,
+        of_one: NormalEquations,
+        of_other: NormalEquations,
+        weight: float,
+        geometry_before: dict[tuple[str, str], tuple[float, float]],
+    ) -> None:
+        error, s, variance, b, across = _distance_error(one, other)
+        if variance == 0.0:
+            return
+        pair = one.name, other.name
+        before = geometry_before.get(pair)
+        if before is None:
+            self._geometry[pair] = b, across
+            return
+        mean_b, mean_across = before
+        self._geometry[pair] = (
+            mean_b + LAST_SHARE * (b - mean_b),
+            mean_across + LAST_SHARE * (across - mean_across),
+        )
+        if mean_across > CURVED * s * s:
+            return
+        w = weight / variance
+        self._squares += w * error * error
+        self._pairs += weight
+        self._total.add(w, s, mean_b, error)
+        of_one.add(w, s, mean_b, error)
+        of_other.add(w, s, mean_b, error)
+
+    def _of(self, name: str) -> NormalEquations:
+        known = self._of_object.get(name)
+        if known is None:
+            known = self._of_object[name] = NormalEquations(NO_SUMS)
+        return known
+
+    def evidence(self) -> RangeEvidence:
+        of_object = {n: part.sums() for n, part in self._of_object.items() if part.ss > 0.0}
+        parts = self._total.sums(), self._squares, self._pairs, of_object, self._geometry
+        return new(RangeEvidence, parts)
 
 
 def _distance_error(
@@ -231,11 +238,12 @@ def _distance_error(
 ) -> tuple[float, float, float, float, float]:
     """By how much the distance between two landmarks is read too short (m), what a share of one
     makes of it, its variance (m^2; 0: nothing can be said), and how the pair was seen."""
-    distance = _hypot(other.map_x - one.map_x, other.map_y - one.map_y)
+    map_dx, map_dy = other.map_x - one.map_x, other.map_y - one.map_y
+    distance = sqrt(map_dx * map_dx + map_dy * map_dy)
     dx, dy = other.x - one.x, other.y - one.y
-    read = _hypot(dx, dy)
-    if read == 0.0:
-        return NOTHING
+    read = sqrt(dx * dx + dy * dy)
+    if read == 0.0 or distance == 0.0:
+        return NO_SUMS
     along_x, along_y = dx / read, dy / read
     of_one = (one.x * along_x + one.y * along_y) / one.range_m
     of_other = (other.x * along_x + other.y * along_y) / other.range_m
@@ -245,7 +253,9 @@ def _distance_error(
     variance += c_other * other.of_range + s_other * other.of_bearing
     across = s * one.of_range + c * one.of_bearing
     across += s_other * other.of_range + c_other * other.of_bearing
-    if distance == 0.0:
-        return NOTHING
     error = distance - (read - 0.5 * across / distance)
     return error, distance, variance, of_other - of_one, across
+
+
+def _name(landmark: SeenLandmark) -> str:
+    return landmark.name

@@ -11,8 +11,11 @@ from typing import Final, NamedTuple
 
 from cpcbl_team.config import Field, LocalizationSettings, LocalizerSettings
 from cpcbl_team.estimate import Covariance3, Estimate
+from cpcbl_team.initial_pose import estimate_of
+from cpcbl_team.inputs import InitialPose
 from cpcbl_team.landmarks import Landmarks
 from cpcbl_team.map_rejections import MapRejections
+from cpcbl_team.map_residuals import NO_RESIDUALS
 from cpcbl_team.miscalibration import (
     AS_CONFIGURED,
     Adaptation,
@@ -20,6 +23,7 @@ from cpcbl_team.miscalibration import (
 )
 from cpcbl_team.recovery_evidence import WINDOW_NS, latest
 from cpcbl_team.relocalization import UNKNOWNS, are_apart, readings_of, relocalize
+from cpcbl_team.sender_comparisons import SenderRecords
 from cpcbl_team.sensor_mistakes import (
     MIRRORED,
     ExplainingMistake,
@@ -33,7 +37,7 @@ from cpcbl_team.state import (
     with_common_errors,
     with_recovery,
 )
-from cpcbl_team.trust import reset_scores
+from cpcbl_team.trust import forget_reports, reset_scores
 from cpcbl_team.trusted_pose import (
     agrees,
     expected_pose,
@@ -47,6 +51,7 @@ INFLATION_NS: Final = 1_000_000_000
 DOUBT_NS: Final = 5_000_000_000  # wrong inputs are named before they move a robot elsewhere
 QUESTION_NS: Final = 2_000_000_000  # a suspicious robot asks so often whether it is elsewhere
 SUSPICIOUS: Final = 2  # of the last innovations rejected; of 20 that is 2 in 10 000 times
+UNCONFIRMED: Final = 3  # of them, for a robot to which nothing can tell that it is where it was
 _LEVER_M = 2.0  # over such a way an error of position has become one of heading
 
 
@@ -140,8 +145,11 @@ def undetermined(
     readings of different objects determine none, and without a bearing no readings determine a
     heading. (Along the way they may: see `relocalize`.)
     """
-    accepted = [e for e in evidence if objects_ns.get(e.source, kidnapped_ns) > kidnapped_ns]
-    if not evidence or any(e.heading_rad is not None for e in accepted):
+    if not evidence:
+        return ""
+    since = [e for e in evidence if e.stamp_ns > kidnapped_ns]
+    accepted = [e for e in since if objects_ns.get(e.source, kidnapped_ns) > kidnapped_ns]
+    if any(e.heading_rad is not None for e in accepted):
         return ""
     readings = {e.source: readings_of(e) for e in accepted}
     names = sorted(readings)
@@ -190,7 +198,7 @@ class Recovery:
         limits = self._limits_when_lost if memory.lost else self._limits
         reason = lost_reason(state.estimate, state.updates.innovations, limits)
         if memory.kidnapped_ns >= 0 and not reason:
-            evidence = self._evidence_since(state, memory.kidnapped_ns)
+            evidence = self.evidence(memory, state.memory.calibration.adaptation)
             reason = undetermined(evidence, state.updates.objects_ns, memory.kidnapped_ns)
         if reason:
             return self._recover(state, reason)
@@ -212,6 +220,11 @@ class Recovery:
             return state
         elif now - memory.suspected_ns > WINDOW_NS:
             return with_recovery(state, memory._replace(suspected_ns=-1, trusted=None))
+        if rejected_of(state.updates.innovations)[0] >= UNCONFIRMED and (
+            reason := self._unconfirmed(state, memory.suspected_ns)
+        ):
+            memory = memory._replace(kidnapped_ns=memory.suspected_ns)
+            return self._recover(with_recovery(state, memory), reason)
         if now - max(memory.relocalization_ns, memory.suspected_ns + DOUBT_NS) < QUESTION_NS:
             return state
         evidence = self._evidence_since(state, memory.suspected_ns)
@@ -223,6 +236,15 @@ class Recovery:
         if mistake := self._explaining_mistake(state, memory, found, own):
             return self._at_trusted_pose(state.counted("lost"), memory, mistake)
         return self._found(state.counted("lost"), found, memory)
+
+    def _unconfirmed(self, state: State, since_ns: int) -> str:
+        """Why nothing that a suspicious robot measures can confirm its pose: it is ranges to one
+        object, which agree with any pose at that distance. Empty if something can."""
+        evidence = self._evidence_since(state, since_ns)
+        is_determined = any(e.bearing_rad is not None or e.range_m is None for e in evidence)
+        if is_determined or len({e.source for e in evidence}) != 1:
+            return ""
+        return undetermined(evidence, state.updates.objects_ns, since_ns)
 
     def _recover(self, state: State, reason: str) -> State:
         """The next state of a robot that is lost for this reason."""
@@ -236,7 +258,7 @@ class Recovery:
         # What was measured before the rejections began may have been measured elsewhere.
         since_ns = memory.kidnapped_ns
         if since_ns < 0 and is_rejecting:
-            since_ns = updates.accepted_ns
+            since_ns = min(updates.accepted_ns, memory.inflated_ns)
         evidence = self._evidence_since(state, since_ns)
         if evidence and evidence[-1].stamp_ns > memory.relocalization_ns:
             memory = memory._replace(relocalization_ns=evidence[-1].stamp_ns)
@@ -251,10 +273,9 @@ class Recovery:
         estimate = state.estimate
         if is_rejecting and now - memory.inflated_ns >= INFLATION_NS:
             estimate = inflate_covariance(estimate, self._settings)
-            kidnapped_ns = memory.kidnapped_ns
-            if kidnapped_ns < 0 or now - updates.accepted_ns > INFLATION_NS:
-                kidnapped_ns = updates.accepted_ns
-            memory = memory._replace(inflated_ns=now, kidnapped_ns=kidnapped_ns)
+            if now - updates.accepted_ns > INFLATION_NS:
+                since_ns = updates.accepted_ns
+            memory = memory._replace(inflated_ns=now, kidnapped_ns=since_ns)
         return with_recovery(state, memory)._replace(estimate=estimate)
 
     def _regained(self, state: State) -> State:
@@ -264,22 +285,46 @@ class Recovery:
         evidence = self._evidence_since(state, max(memory.kidnapped_ns, memory.suspected_ns))
         if mistake := self._explaining_mistake(state, memory, state.estimate, evidence):
             return self._at_trusted_pose(state, memory, mistake)
+        if memory.kidnapped_ns < 0 and memory.trusted is not None:
+            since = self._evidence_since(state, memory.inflated_ns)
+            if all(e.bearing_rad is None and e.heading_rad is None for e in since):
+                # Ranges led its position along, whatever its heading is: it must be confirmed
+                return with_recovery(state, memory._replace(kidnapped_ns=memory.inflated_ns))
         memory = with_jump(state, memory, state.estimate.pose)
         return with_recovery(state, memory._replace(lost="", kidnapped_ns=-1))
 
     def _found(self, state: State, estimate: Estimate, recovery: RecoveryMemory) -> State:
-        """The state of a robot that is found again: here everything begins anew."""
-        _, teammates, calibration, _ = memory = state.memory.counted("found_again")
+        """The state of a robot that is found again."""
+        recovery = with_jump(state, recovery, estimate.pose)._replace(
+            lost="", kidnapped_ns=-1, suspected_ns=-1
+        )
+        senders = reset_scores(state.memory.teammates.senders)
+        state = state.counted("found_again")
+        return self._begun_anew(state, estimate, recovery, senders)
+
+    def with_given_pose(self, state: State, given: InitialPose) -> State:
+        """The state of a robot whose pose somebody sets. What it measured before may have been
+        measured elsewhere. If it believed to be elsewhere, teammates that disagreed with it may
+        have been right."""
+        estimate, senders = estimate_of(given), state.memory.teammates.senders
+        if not agrees(state.estimate, estimate):
+            senders = forget_reports(senders, state.stamp_ns)
+        return self._begun_anew(state, estimate, RecoveryMemory(), senders)
+
+    def _begun_anew(
+        self, state: State, estimate: Estimate, recovery: RecoveryMemory, senders: SenderRecords
+    ) -> State:
+        """The state of a robot that begins anew with an estimate that its former one is not in."""
+        _, teammates, calibration, _ = memory = state.memory
         common = calibration.common
         memory = memory._replace(
-            recovery=with_jump(state, recovery, estimate.pose)._replace(
-                lost="", kidnapped_ns=-1, suspected_ns=-1
-            ),
-            teammates=teammates._replace(senders=reset_scores(teammates.senders)),
+            recovery=recovery,
+            teammates=teammates._replace(senders=senders),
             calibration=calibration._replace(
                 references=None,
                 check=calibration.check.restarted(state.updates.accepted),
                 rejections=MapRejections(stamp_ns=state.stamp_ns, counted=state.updates.accepted),
+                residuals=NO_RESIDUALS,
                 common=None if common is None else common.uncorrelated(),
             ),
         )

@@ -89,6 +89,12 @@ def without_senders(memory: RecoveryMemory, senders: Collection[str]) -> Recover
     return memory if len(kept) == len(memory.evidence) else memory._replace(evidence=kept)
 
 
+def without_evidence(memory: RecoveryMemory) -> RecoveryMemory:
+    """The memory of a robot that drove nobody knows where: dead reckoning does not lead from older
+    evidence to its present pose."""
+    return with_records(memory, (), (), frozenset(), 0)
+
+
 def latest(stamped: tuple[Stamped, ...]) -> tuple[Stamped, ...]:
     """Without what is too old, or too much."""
     kept = stamped[-MOST_PIECES:]

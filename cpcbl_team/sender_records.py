@@ -154,6 +154,21 @@ def with_report(record: SenderRecord, report: TeammateReport, limit: float) -> S
     return _with_nis(record, report, report.nis, limit)
 
 
+def without_comparisons(record: SenderRecord) -> SenderRecord:
+    """The record without what the reports said of an estimate that is no longer the robot's."""
+    new = SenderRecord()
+    return replace(
+        record,
+        mean_offset=new.mean_offset,
+        offset_variance=new.offset_variance,
+        position=new.position,
+        offsets=new.offsets,
+        means=new.means,
+        headings=new.headings,
+        courses=new.courses,
+    )
+
+
 def with_evidence(record: SenderRecord, stamp_ns: int, report: OffsetEvidence) -> SenderRecord:
     """The record with one more report in its means."""
     evidence, dependent, heading_variance, variance = report

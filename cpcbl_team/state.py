@@ -17,6 +17,7 @@ from cpcbl_team.estimate import HEADING, POSE, POSITION, Covariance3, Estimate, 
 from cpcbl_team.geometry import Pose2, new, wrap_angle
 from cpcbl_team.inputs import Belief, Odometry, Sighting
 from cpcbl_team.map_rejections import MapRejections
+from cpcbl_team.map_residuals import MapResiduals
 from cpcbl_team.miscalibration import (
     AS_CONFIGURED,
     Adaptation,
@@ -76,7 +77,8 @@ class Updates(NamedTuple):
 def with_uses(objects_ns: Mapping[str, int], used: Mapping[str, int]) -> Mapping[str, int]:
     """The last uses of objects with these. Where there are too many, as after guests of ever new
     names, the older half is forgotten."""
-    uses = {**objects_ns, **used}
+    uses = dict(objects_ns)
+    uses.update(used)
     if len(uses) <= MOST_OBJECTS:
         return uses
     newest = sorted(uses, key=uses.__getitem__)[len(uses) // 2 :]
@@ -164,6 +166,7 @@ class CalibrationMemory(NamedTuple):
     common: CommonErrors | None = None
     """What is known of the constant errors of the camera; None without a camera whose errors the
     filter considers."""
+    residuals: MapResiduals = MapResiduals()
 
     @property
     def corrected(self) -> SelfCalibration:
@@ -174,6 +177,10 @@ class CalibrationMemory(NamedTuple):
             turn_scale=self.learned.turn_scale * adapted.turn_scale,
             bearing_bias_rad=self.bearing_bias_rad,
         )
+
+    def misplaced(self, stamp_ns: int) -> str:
+        """The object that must stand elsewhere than on the map; empty if there is none."""
+        return self.rejections.misplaced(stamp_ns) or self.residuals.misplaced()
 
     @property
     def bearing_bias_rad(self) -> float:
@@ -321,8 +328,14 @@ def with_records(
     until_ns: int,
 ) -> RecoveryMemory:
     """The recovery's memory with other evidence, and the sources of which no more is needed."""
-    records = snapshots, evidence, recorded, until_ns
-    return new(RecoveryMemory, (*recovery[:3], *records, *recovery[7:]))
+    lost, inflated_ns, relocated_ns, _, _, _, _, kidnapped_ns, suspected_ns, pose, mistake, jump = (
+        recovery
+    )
+    parts = (
+        lost, inflated_ns, relocated_ns, snapshots, evidence, recorded, until_ns,
+        kidnapped_ns, suspected_ns, pose, mistake, jump,
+    )  # fmt: skip
+    return new(RecoveryMemory, parts)
 
 
 def with_correction(state: State, estimate: Estimate, updates: Updates) -> State:

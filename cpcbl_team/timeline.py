@@ -17,6 +17,7 @@ from cpcbl_team.inputs import (
     BeliefShared,
     Fix,
     HeadingBelief,
+    InitialPose,
     Input,
     InputsMended,
     Odometry,
@@ -36,6 +37,7 @@ _content = msgspec.msgpack.Encoder(enc_hook=float).encode
 _apply: dict[type, Callable[[Localizer, State, Input], State]] = {
     Belief: Localizer.add_teammate_belief,  # type: ignore[dict-item]
     HeadingBelief: Localizer.add_teammate_belief,  # type: ignore[dict-item]
+    InitialPose: Localizer.set_pose,  # type: ignore[dict-item]
     Sightings: Localizer.cycle,  # type: ignore[dict-item]
     Position: Localizer.add_position,  # type: ignore[dict-item]
     Fix: Localizer.add_fix,  # type: ignore[dict-item]
@@ -45,7 +47,8 @@ _apply: dict[type, Callable[[Localizer, State, Input], State]] = {
 }
 _rank = {kind: rank for rank, kind in enumerate(_apply)}
 """The order of inputs of the same time. Odometry comes last: a piece that starts at a frame's time
-usually arrives after the frame, and does not change the pose at that time."""
+usually arrives after the frame, and does not change the pose at that time. A pose that somebody
+sets comes before what is measured at the same time, which then corrects it."""
 
 
 def _measured_ns(item: Input) -> int:

@@ -45,6 +45,7 @@ from cpcbl_team.sender_records import (
     released,
     with_evidence,
     with_report,
+    without_comparisons,
 )
 
 FRESH_BELIEF_NS: Final = 300_000_000  # the robot of an older belief may have turned since
@@ -335,6 +336,11 @@ def forgive(senders: SenderRecords, now_ns: int) -> SenderRecords:
         n: released(r, now_ns) if r.reason in _BY_COMPARISON else replace(r, score=0.0)
         for n, r in senders.items()
     }
+
+
+def forget_reports(senders: SenderRecords, now_ns: int) -> SenderRecords:
+    """The same, where another estimate has replaced that with which the reports were compared."""
+    return {n: without_comparisons(r) for n, r in forgive(senders, now_ns).items()}
 
 
 def trust_statuses(senders: SenderRecords, now_ns: int) -> tuple[TrustStatus, ...]:

@@ -49,12 +49,10 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 @pytest.fixture(autouse=True)
-def log_levels_are_as_before() -> Iterator[None]:
-    """A command that runs in the process of a test may say less of the bus than others."""
-    bus = logging.getLogger("cpcbl_transport")
-    level = bus.level
-    yield
-    bus.setLevel(level)
+def log_levels_are_as_at_first() -> None:
+    """A command that ran in the process of a test, or of a module's fixture, may say less of the
+    bus than others."""
+    logging.getLogger("cpcbl_transport").setLevel(logging.NOTSET)
 
 
 @pytest.fixture(autouse=True, scope="module")

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from cpcbl_agents.filtering import OFF_FIELD
 from cpcbl_agents.input_diagnosis.problems import REASONS
 from cpcbl_launch.lab.chaos.scenarios import SCENARIOS
 from cpcbl_team.inputs import SightingFault
@@ -108,7 +109,7 @@ def test_every_reason_of_a_refusal_has_its_remedy_in_the_docs() -> None:
     vision = ROOT / "agents/cpcbl_agents/vision"
     code = "".join((vision / name).read_text() for name in ("pictures.py", "detector.py"))
     images = set(re.findall(r'"((?:frame|camera)_\w+)"', code))
-    faults = {*SightingFault, *TimelineRefusal, *images, "seen_twice", "no_camera"}
+    faults = {*SightingFault, *TimelineRefusal, *images, "seen_twice", "no_camera", OFF_FIELD}
     assert listed == {str(reason) for reason in {*Refusal, *faults, "unknown_object"}}
     assert set(REASONS) <= listed
     inputs = {str(r) for r in {*Refusal, *faults}} - set(REASONS)

@@ -1,5 +1,6 @@
 """The filter agent: it takes inputs in any order and reports pose estimates."""
 
+import math
 from collections import Counter, deque
 from collections.abc import Sequence
 
@@ -9,6 +10,7 @@ from cpcbl_team.inputs import (
     Belief,
     BeliefShared,
     Fix,
+    InitialPose,
     Input,
     InputsMended,
     Odometry,
@@ -22,8 +24,10 @@ from cpcbl_team.self_calibration import SelfCalibration
 from cpcbl_team.sensors import recalibrated
 from cpcbl_team.timeline import Timeline
 from cpcbl_team.trust import TrustStatus, trust_statuses
+from cpcbl_transport.messages import input_name
 
 REPORT_INTERVAL_NS = 100_000_000
+OFF_FIELD = "off_field"  # why a pose is not set
 ODOMETRY_WAIT_NS = 200_000_000  # how long a frame waits for the odometry that covers it
 
 
@@ -44,6 +48,11 @@ class FilterAgent:
         self.counts: Counter[str] = Counter()
         self.refused: Counter[tuple[str, str]] = Counter()
         """The same of inputs: by the name of the input, and the reason."""
+        self.initial_pose: InitialPose | None = None
+        """The newest that somebody has set."""
+        self._field = field
+        has_own = settings.position_sensor is not None  # which may lead it anywhere
+        self._farthest_m = math.inf if has_own else 2.0 * settings.sensor.max_range_m
         self._known = frozenset(field.landmarks) | frozenset(field.walls) | teammates
         self._guests: set[str] = set()
         self._moves = settings.odometry.moves
@@ -65,7 +74,7 @@ class FilterAgent:
         state = self.timeline.state
         calibration = state.memory.calibration
         factors = percentages(calibration.adaptation)
-        if name := calibration.rejections.misplaced(state.stamp_ns):
+        if name := calibration.misplaced(state.stamp_ns):
             factors[MISPLACED + name] = 1
         return self.counts + Counter(self.timeline.state.counts) + Counter(factors)
 
@@ -95,6 +104,8 @@ class FilterAgent:
                 return self._frame_estimates(now_ns)
             case Position() | Belief() | Fix() | BeliefShared() | InputsMended():
                 self._add(message)
+            case InitialPose():
+                self._set_pose(message)
             case Presence(name, None):
                 self._guests.discard(name)
             case Presence(name) if name not in self._known:
@@ -108,10 +119,21 @@ class FilterAgent:
         refusal = self.timeline.add(item)
         if refusal:
             self.counts[refusal] += 1
-            if isinstance(item, Odometry | Sightings | Position):
+            if isinstance(item, Odometry | Sightings | Position | InitialPose):
                 number = len(item.sightings) or 1 if isinstance(item, Sightings) else 1
-                self.refused[type(item).__name__.lower(), refusal] += number
+                self.refused[input_name(item), refusal] += number
         return not refusal
+
+    def _set_pose(self, given: InitialPose) -> None:
+        """Sets the pose, unless neither a landmark nor a teammate that sees one could be seen from
+        there: then it is of another map, or in another unit."""
+        if self._field.distance(given.x_m, given.y_m) > self._farthest_m:
+            self.counts[OFF_FIELD] += 1
+            self.refused[input_name(given), OFF_FIELD] += 1
+            return
+        latest = self.initial_pose
+        if self._add(given) and (latest is None or given.stamp_ns >= latest.stamp_ns):
+            self.initial_pose = given
 
     def _regular_estimate(self, now_ns: int) -> PoseEstimate:
         self._reported_ns = now_ns

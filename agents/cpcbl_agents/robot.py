@@ -22,7 +22,7 @@ from cpcbl_agents.waypoint_follower import WaypointFollower
 from cpcbl_team.camera_filter import considers_camera
 from cpcbl_team.config import Team
 from cpcbl_team.estimate import Estimate
-from cpcbl_team.inputs import BeliefShared, InputsMended, SightingFault
+from cpcbl_team.inputs import BeliefShared, InitialPose, InputsMended, SightingFault
 from cpcbl_team.recovery import rejected_of
 from cpcbl_team.state import CalibrationMemory, Jump
 from cpcbl_team.trust import TrustStatus
@@ -45,6 +45,7 @@ class InputSnapshot(NamedTuple):
     rejected: tuple[int, int] = (0, 0)  # of the latest innovations, and how many these are
     accepted: int = 0  # measurements since the start
     suspected_ns: int = -1  # since when it rejects more than it should; -1: it does not
+    initial_pose: InitialPose | None = None  # the newest that somebody has set
 
 
 class Robot:
@@ -125,6 +126,7 @@ class Robot:
             rejected=rejected_of(state.updates.innovations),
             accepted=state.counts.get("accepted", 0),
             suspected_ns=recovery.suspected_ns,
+            initial_pose=self.filter.initial_pose,
         )
 
     def pose(self, now_ns: int) -> Pose:

@@ -1,12 +1,13 @@
 """What a robot's process logs for people: each thing once, when it begins or ends."""
 
 import logging
+from collections import Counter
 from collections.abc import Sequence
 
 from cpcbl_agents.input_diagnosis.problems import without_numbers
 from cpcbl_agents.robot_state import RobotState, robot_state
 from cpcbl_team.config import Team
-from cpcbl_transport.messages import Status
+from cpcbl_transport.messages import InputHealth, Status
 
 log = logging.getLogger(__name__)
 
@@ -22,6 +23,7 @@ class RobotLogger:
         self._lost: str | None = None
         self._unconfirmed = ""
         self._problems: dict[str, str] = {}
+        self._initial_poses: Counter[str] = Counter()  # by the reason of a refusal
 
     def log_connected(self, team: Team, endpoints: Sequence[str]) -> None:
         """Logs that a router answered, and what the robot waits for now."""
@@ -33,7 +35,9 @@ class RobotLogger:
     def log_status(self, status: Status) -> None:
         """To be called with each status, once a second."""
         for health in status.inputs:
-            if health.taken and health.input not in self._fed:
+            if health.input == "initial_pose":
+                self._log_initial_poses(health)
+            elif health.taken and health.input not in self._fed:
                 self._fed.add(health.input)
                 log.info("%s: first %s", self._robot, health.input)
         for flow in status.heard:
@@ -56,6 +60,16 @@ class RobotLogger:
             if what not in problems:
                 log.info("%s: over: %s", self._robot, text)
         self._problems = problems
+
+    def _log_initial_poses(self, health: InputHealth) -> None:
+        """Each that somebody gives is meant to count, so each is said."""
+        now = Counter({"": health.taken, **health.refused})
+        for reason in now - self._initial_poses:
+            if reason:
+                log.warning("%s: a pose that somebody gave is refused: %s", self._robot, reason)
+            else:
+                log.info("%s: somebody has set its pose", self._robot)
+        self._initial_poses = now
 
     def _log_pose(self, state: RobotState, sigma_m: float) -> None:
         if state.word == "lost":

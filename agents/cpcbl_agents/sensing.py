@@ -12,15 +12,16 @@ from cpcbl_agents.detection_worker import DetectedFrame, DetectionWorker, detect
 from cpcbl_agents.sources import OwnCamera, Picture, Source
 from cpcbl_agents.waypoint_follower import WaypointFollower
 from cpcbl_team.config import LocalizationSettings
-from cpcbl_team.inputs import Odometry, Position, Sightings
+from cpcbl_team.inputs import InitialPose, Odometry, Position, Sightings
 from cpcbl_team.sensors import corrected_odometry, corrected_sighting, without_duplicates
-from cpcbl_transport.messages import Frame, SensorInput
+from cpcbl_transport.messages import Frame, SensorInput, input_name
 
 if TYPE_CHECKING:  # it needs OpenCV
     from cpcbl_agents.vision.camera_correction import CameraCorrection
     from cpcbl_agents.vision.detector import CameraDetector
 
 ANNOTATION_INTERVAL_NS = 500_000_000
+UncorrectedInput = Odometry | Sightings | Position | InitialPose
 
 
 class SensingAgent:
@@ -98,7 +99,7 @@ class SensingAgent:
                 outgoing = [out for item in items for out in self._process(item)]
                 results = self._worker.collect() if self._worker is not None else ()
                 return [*outgoing, *(out for found in results for out in self._take(found))]
-            case Odometry() | Sightings() | Position() | Frame():
+            case Odometry() | Sightings() | Position() | InitialPose() | Frame():
                 return self._process(message)
             case FrameSubscribers():
                 self._has_subscribers = message.present
@@ -155,10 +156,12 @@ class SensingAgent:
         while self._held and self._held[0].stamp_ns <= until_ns and self._correction is not None:
             self._correction.add_odometry(self._held.pop(0))
 
-    def _correct(self, item: Odometry | Sightings | Position) -> Odometry | Sightings | Position:
+    def _correct(self, item: UncorrectedInput) -> UncorrectedInput:
         if isinstance(item, Sightings):
             return self._corrected_frame(item)
-        self._counts[type(item).__name__.lower()] += 1
+        self._counts[input_name(item)] += 1
+        if isinstance(item, InitialPose):
+            return item
         if isinstance(item, Odometry):
             piece = corrected_odometry(item, self._odometry)
             self._add_odometry(piece)

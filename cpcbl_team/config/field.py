@@ -59,6 +59,13 @@ class Field(Table, frozen=True, kw_only=True):
         xs, ys = [p[0] for p in points], [p[1] for p in points]
         return min(xs), min(ys), max(xs), max(ys)
 
+    def distance(self, x_m: float, y_m: float) -> float:
+        """How far a point is outside of the bounds; zero inside, and where the map is empty."""
+        if not (self.landmarks or self.walls):
+            return 0.0
+        x0, y0, x1, y1 = self.bounds()
+        return math.hypot(max(x0 - x_m, 0.0, x_m - x1), max(y0 - y_m, 0.0, y_m - y1))
+
 
 class SimulationEvent(Table, frozen=True, kw_only=True):
     """Something that happens on the simulated field: a robot is carried away, or landmarks are

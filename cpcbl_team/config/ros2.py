@@ -99,6 +99,11 @@ class Ros2RobotSettings(Table, frozen=True, kw_only=True):
     """sensor_msgs/NavSatFix as a position; needs `ros2.datum`."""
     position: str = ""
     """geometry_msgs/PoseWithCovarianceStamped as a position in the field's frame."""
+    initial_pose: str = "initialpose"
+    """geometry_msgs/PoseWithCovarianceStamped in the field's frame that replaces the robot's pose:
+    the button "2D Pose Estimate" of RViz."""
+    tf_static: str = "tf_static"
+    """tf2_msgs/TFMessage: where the frames of sensors are on the robot."""
     odometry_frame: str = "odom"
     """The frame of odometry: what its messages must name, with or without a prefix."""
     base_frame: str = ""
@@ -106,6 +111,9 @@ class Ros2RobotSettings(Table, frozen=True, kw_only=True):
     fastest_m_s: Positive = 5.0
     """Poses of odometry that imply a higher speed are a jump or a reset, and move nothing."""
     fastest_turn_rad_s: Positive = 10.0
+    map_frame: str = ""
+    """The robot's own frame of the field, such as r1/map, for a tree of its own; empty:
+    `field_frame`. Poses are in it, and a static transform says that it is the field's frame."""
     pose: str = "amcl_pose"
     """geometry_msgs/PoseWithCovarianceStamped, where AMCL has its own."""
     pose_odometry: str = ""

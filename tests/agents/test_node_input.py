@@ -28,7 +28,7 @@ from support.nodes import (
 )
 
 from cpcbl_agents.inbox import INBOX
-from cpcbl_team.inputs import Belief, Fix, Odometry, Position, Sighting, Sightings
+from cpcbl_team.inputs import Belief, Fix, InitialPose, Odometry, Position, Sighting, Sightings
 from cpcbl_team.timeline import HORIZON_NS
 from cpcbl_transport import topics
 from cpcbl_transport.messages import (
@@ -43,11 +43,15 @@ from cpcbl_transport.messages import (
 )
 
 COVARIANCE = (0.0004, 0.0, 0.0004, 0.0, 0.0, 0.0001)
-IN_ODOMETRY, IN_SIGHTINGS, IN_POSITION, IN_FRAME = (t.at(robot="me") for t in topics.INPUTS)
+IN_ODOMETRY, IN_SIGHTINGS, IN_POSITION, IN_INITIAL_POSE, IN_FRAME = (
+    topic.at(robot="me") for topic in topics.INPUTS
+)
 FIX_KEY = topics.FIX.at(robot="me", tier=2, observer="mate")
 BELIEF = Belief("mate", NOW, 2.0, 0.0, 0.0, COVARIANCE)
 FIX = Fix("me", "mate", NOW, 0.1, 0.0, (0.01, 0.0, 0.01), (0.0004, 0.0, 0.0004))
 POSITION = Position(NOW, 0.1, 0.0, (0.01, 0.0, 0.01))
+INITIAL_POSE = InitialPose(NOW, 0.1, 0.0, 0.0, (0.25, 0.0, 0.25, 0.0, 0.0, 0.07))
+AFTER_SENSING = ("off_field", "too_late")  # which counts what comes
 MATE_SEEN = Sighting("mate", 2.0, 0.0)
 
 
@@ -89,6 +93,23 @@ BAD = [
     Bad(Refusal.IMPLAUSIBLE, IN_ODOMETRY, Odometry(NOW, NOW + 50 * MS, -1e7, 0.0)),
     Bad(Refusal.IMPLAUSIBLE, BELIEF_KEY, changed(BELIEF, covariance=(1e7,) * 6)),
     Bad(Refusal.NOT_A_COVARIANCE, IN_POSITION, changed(POSITION, covariance=(-1.0, 0.0, 1.0))),
+    Bad(Refusal.NOT_FINITE, IN_INITIAL_POSE, changed(INITIAL_POSE, heading_rad=math.nan)),
+    Bad(Refusal.NOT_FINITE, IN_INITIAL_POSE, changed(INITIAL_POSE, covariance=(math.nan,) * 6)),
+    Bad(Refusal.IMPLAUSIBLE, IN_INITIAL_POSE, changed(INITIAL_POSE, x_m=1e7)),
+    Bad(
+        Refusal.NOT_A_COVARIANCE,
+        IN_INITIAL_POSE,
+        changed(INITIAL_POSE, covariance=(0.1, 0.0, 0.1, 0.0, 0.0, -0.1)),
+    ),
+    Bad(
+        Refusal.NOT_A_COVARIANCE,  # each pair could be one
+        IN_INITIAL_POSE,
+        changed(INITIAL_POSE, covariance=(1.0, 0.9, 1.0, 0.9, -0.9, 1.0)),
+    ),
+    Bad("off_field", IN_INITIAL_POSE, changed(INITIAL_POSE, x_m=1200.0)),
+    Bad("too_late", IN_INITIAL_POSE, changed(INITIAL_POSE, stamp_ns=NOW - HORIZON_NS - SECOND)),
+    Bad(Refusal.FUTURE, IN_INITIAL_POSE, changed(INITIAL_POSE, stamp_ns=NOW + SECOND)),
+    Bad(Refusal.WRONG_TYPE, IN_INITIAL_POSE, POSITION),
     Bad(Refusal.FUTURE, BELIEF_KEY, changed(BELIEF, stamp_ns=NOW + SECOND)),
     Bad(Refusal.FUTURE, FIX_KEY, changed(FIX, stamp_ns=NOW + SECOND)),
     Bad(Refusal.CLOCK, BELIEF_KEY, changed(BELIEF, stamp_ns=NOW + 300 * MS)),
@@ -121,7 +142,8 @@ def test_a_bad_payload_is_counted_and_changes_nothing_else(bad: Bad) -> None:
     assert estimate(with_it) == estimate(without)
     assert estimate(with_it) != estimate(only_me())
     counts = [stand.status("me").counts for stand in (with_it, without)]
-    assert counts[0] == {**counts[1], bad.reason: 1}
+    came = {"initial_pose": 1} if bad.reason in AFTER_SENSING and bad.key == IN_INITIAL_POSE else {}
+    assert counts[0] == {**counts[1], **came, bad.reason: 1}
 
 
 @pytest.mark.parametrize(
@@ -132,6 +154,7 @@ def test_a_bad_payload_is_counted_and_changes_nothing_else(bad: Bad) -> None:
         (IN_ODOMETRY, Odometry(NOW, NOW + 100 * MS, 0.1, 0.0), ["odometry"]),
         (IN_SIGHTINGS, saw(NOW, Sighting("oak", 4.0, 0.0)), ["sightings"]),
         (IN_POSITION, POSITION, ["position"]),
+        (IN_INITIAL_POSE, INITIAL_POSE, ["initial_pose"]),
     ],
     ids=lambda part: type(part).__name__,
 )
@@ -172,6 +195,9 @@ HUGE, TINY = 1e200, 1e-200
         (IN_SIGHTINGS, saw(NOW, Sighting("oak", 4.0, 0.0, TINY, TINY))),
         (IN_SIGHTINGS, saw(NOW, Sighting("oak", 4.0, 0.0, HUGE, HUGE))),
         (IN_SIGHTINGS, saw(NOW, Sighting("oak", TINY, 0.0))),
+        (IN_SIGHTINGS, saw(NOW, Sighting("mate", TINY, 0.0))),
+        (IN_INITIAL_POSE, changed(INITIAL_POSE, x_m=HUGE)),
+        (IN_INITIAL_POSE, changed(INITIAL_POSE, covariance=(HUGE, 0.0, HUGE, 0.0, 0.0, HUGE))),
         (IN_ODOMETRY, Odometry(NOW, NOW + 50 * MS, HUGE, 0.0)),
         (IN_ODOMETRY, Odometry(NOW, NOW + 50 * MS, 0.1, HUGE)),
         (FIX_KEY, changed(FIX, x_m=HUGE)),
@@ -192,6 +218,9 @@ HUGE, TINY = 1e200, 1e-200
         "tiny sigmas",
         "huge sigmas",
         "tiny range",
+        "tiny range of a teammate",
+        "pose set far away",
+        "pose set of no worth",
         "distance",
         "turn",
         "fix far away",
@@ -241,6 +270,10 @@ PLANE = st.tuples(VARIANCE, NONE, VARIANCE)
             ),
         ),
         st.tuples(st.just(IN_POSITION), st.builds(Position, AT_NOW, FINITE, FINITE, PLANE)),
+        st.tuples(
+            st.just(IN_INITIAL_POSE),
+            st.builds(InitialPose, AT_NOW, *[FINITE] * 3, st.tuples(*[FINITE] * 6)),
+        ),
         st.tuples(
             st.just(FIX_KEY),
             st.builds(Fix, st.just("me"), FROM_MATE, AT_NOW, FINITE, FINITE, PLANE, PLANE),

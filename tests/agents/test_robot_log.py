@@ -46,3 +46,17 @@ def test_each_thing_is_said_once(caplog: pytest.LogCaptureFixture) -> None:
         "r1: no odometry on in/r1/odometry for 3 s",
         "r1: over: no odometry on in/r1/odometry for 5 s",
     ]
+
+
+def test_each_pose_that_somebody_gives_is_said(caplog: pytest.LogCaptureFixture) -> None:
+    logger = RobotLogger("r1")
+    refused: list[tuple[int, dict[str, int]]] = [(0, {}), (1, {}), (1, {"off_field": 1}), (2, {})]
+    with caplog.at_level(logging.INFO):
+        for taken, reasons in refused:
+            health = InputHealth("initial_pose", 0.1, 1, taken, reasons)
+            logger.log_status(status("r1", 1.0, 3, inputs=(health,)))
+    assert [record.message for record in caplog.records if "pose" in record.message][1:] == [
+        "r1: somebody has set its pose",
+        "r1: a pose that somebody gave is refused: off_field",
+        "r1: somebody has set its pose",
+    ]

@@ -12,6 +12,7 @@ from support.mistakes import bearings
 from cpcbl_agents.agent import BeliefSubscribers, Presence
 from cpcbl_team.config import OdometrySettings, Start
 from cpcbl_team.geometry import Pose2, wrap_angle
+from cpcbl_team.inputs import InitialPose
 from cpcbl_transport.decoding import Subscriber
 from cpcbl_transport.messages import Pose
 
@@ -174,3 +175,46 @@ def test_many_rejected_measurements_are_said_before_the_robot_is_lost() -> None:
     assert "the robot rejects" in said[0].unconfirmed
     assert robot.node.robot.collaboration.may_mislead
     assert not any(s.lost for s in said)
+
+
+def set_pose(robot: DrivenRobot, pose: Pose2, sigma_m: float, heading_sigma_deg: float) -> None:
+    """Somebody sets the pose of the robot, as with RViz."""
+    p, h = sigma_m**2, math.radians(heading_sigma_deg) ** 2
+    robot.put(InitialPose(robot.now_ns, *pose, (p, 0.0, p, 0.0, 0.0, h)))
+
+
+@pytest.mark.parametrize(("sigmas", "is_sure"), [((0.5, 15.0), False), ((0.1, 3.0), True)])
+def test_a_pose_that_somebody_sets_is_confirmed_as_a_start_is(
+    sigmas: tuple[float, float], is_sure: bool
+) -> None:
+    robot = DrivenRobot(STAND)
+    robot.run(3.1)
+    assert robot.statuses[-1].unconfirmed
+    set_pose(robot, robot.pose, *sigmas)
+    robot.run(3.1)
+    assert not robot.statuses[-1].lost
+    assert bool(robot.statuses[-1].unconfirmed) is not is_sure
+    assert robot.node.has_moved  # a process that is started again does not begin at the start
+
+
+def test_a_robot_that_is_told_where_it_is_blames_no_driver() -> None:
+    """It stands elsewhere than its start says, until somebody tells it."""
+    settings = {"start": Start(x_m=3.0, y_m=-2.0, heading_deg=200.0)}
+    robot = DrivenRobot(ARC._replace(settings=settings))
+    set_pose(robot, START, 0.5, 15.0)
+    robot.run(12.0)
+    assert {text for s in robot.statuses for text in s.problems} == set()
+    assert not robot.statuses[-1].lost
+    assert not is_wrong(robot)
+
+
+def test_a_wrong_pose_that_somebody_sets_is_found_out() -> None:
+    robot = DrivenRobot(ARC._replace(places=THREE, settings={}))
+    robot.run(3.1)
+    set_pose(robot, Pose2(-2.0, 2.5, -2.0), 0.1, 3.0)
+    robot.run(0.2)
+    assert is_wrong(robot)
+    robot.run(15.0)
+    assert not is_wrong(robot)
+    health = next(one for one in robot.statuses[-1].inputs if one.input == "initial_pose")
+    assert (health.taken, health.refused) == (1, {})

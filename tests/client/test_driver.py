@@ -17,7 +17,7 @@ from cpcbl_client.team import read_team
 from cpcbl_team.config import OdometryNoise
 from cpcbl_team.estimate import ZERO3, Estimate
 from cpcbl_team.geometry import Pose2
-from cpcbl_team.inputs import Odometry, Position, Sightings
+from cpcbl_team.inputs import InitialPose, Odometry, Position, Sightings
 from cpcbl_team.motion import move
 from cpcbl_transport import topics
 from cpcbl_transport.memory_bus import MemoryHub
@@ -86,6 +86,8 @@ def test_every_input_is_the_message_of_its_topic(stand: Stand) -> None:
     assert stand.last == Sightings(NOW - 5, (seen, Sighting("r2", 1.0)))
     driver.position(1, 2, sigma_m=0.5)
     assert stand.last == Position(NOW, 1.0, 2.0, (0.25, 0.0, 0.25))
+    driver.initial_pose(1, 2, 0.5, sigma_m=0.5, heading_sigma_rad=0.25)
+    assert stand.last == InitialPose(NOW, 1.0, 2.0, 0.5, (0.25, 0.0, 0.25, 0.0, 0.0, 0.0625))
     driver.frame(b"a picture")
     assert stand.last == Frame(NOW, b"a picture")
 
@@ -94,6 +96,7 @@ def test_every_input_is_the_message_of_its_topic(stand: Stand) -> None:
     ("call", "arguments", "said"),
     [
         ("sighting", {"name": "door", "bearing_rad": 45.0}, "bearing_rad=45: looks like degrees"),
+        ("initial_pose", {"x_m": 0.0, "y_m": 0.0, "heading_rad": 90.0}, "looks like degrees"),
         ("sighting", {"name": "door", "range_m": 2000.0}, "range_m=2000: looks like mm"),
         (
             "odometry",

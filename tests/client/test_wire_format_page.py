@@ -9,7 +9,7 @@ import msgspec
 from support.buses import SECOND
 
 from cpcbl_team.config import GatewaySettings
-from cpcbl_team.inputs import Odometry, Position, Sightings
+from cpcbl_team.inputs import InitialPose, Odometry, Position, Sightings
 from cpcbl_transport import topics
 from cpcbl_transport.decoding import decode
 from cpcbl_transport.json_messages import encode_json
@@ -37,9 +37,9 @@ def test_the_python_of_the_page_is_that_of_the_programs_that_run() -> None:
 
 def test_the_json_inputs_of_the_page_are_taken() -> None:
     lines = blocks("json")[0].splitlines()
-    keys = ("in/r1/odometry", "in/r1/sightings", "in/r1/position")
+    keys = [f"in/r1/{name}" for name in ("odometry", "sightings", "position", "initial_pose")]
     kinds = [type(decode(key, line.encode())) for key, line in zip(keys, lines, strict=True)]
-    assert kinds == [Odometry, Sightings, Position]
+    assert kinds == [Odometry, Sightings, Position, InitialPose]
 
 
 def test_the_json_output_of_the_page_is_that_of_a_pose() -> None:
@@ -51,7 +51,7 @@ def test_the_json_output_of_the_page_is_that_of_a_pose() -> None:
 
 
 def test_the_table_of_messages_has_every_field() -> None:
-    for kind in (Odometry, Sightings, Position, Frame, Pose):
+    for kind in (Odometry, Sightings, Position, InitialPose, Frame, Pose):
         row = next(
             line for line in PAGE.splitlines() if f"| `{topics.topic_of(kind).key}` |" in line
         )

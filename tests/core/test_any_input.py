@@ -23,7 +23,16 @@ from cpcbl_team.config import Field, Landmark, OdometrySettings, SensorSettings,
 from cpcbl_team.estimate import POSITION, Covariance3, Estimate, Information, merge
 from cpcbl_team.fixes import fix_for
 from cpcbl_team.geometry import Pose2
-from cpcbl_team.inputs import BeliefShared, Fix, Input, Odometry, Position, Sighting, Sightings
+from cpcbl_team.inputs import (
+    BeliefShared,
+    Fix,
+    InitialPose,
+    Input,
+    Odometry,
+    Position,
+    Sighting,
+    Sightings,
+)
 from cpcbl_team.state import State
 from cpcbl_team.timeline import Timeline
 
@@ -56,7 +65,7 @@ def anything(rng: random.Random, count: int) -> Iterator[Input]:
     for _ in range(count):
         now += rng.choice([1, SECOND // 10, SECOND, 30 * SECOND])
         a, b = size(), size()
-        kind = rng.randrange(6)
+        kind = rng.randrange(7)
         if kind == 0:
             yield Odometry(now - 1, now, rng.choice([0.0, size()]), rng.uniform(-9.0, 9.0))
         elif kind == 1:
@@ -76,6 +85,8 @@ def anything(rng: random.Random, count: int) -> Iterator[Input]:
         elif kind == 4:
             told = belief(*place(), now)
             yield replace(told, covariance=(a, 0.0, a, 0.0, 0.0, b), speed_m_s=rng.uniform(-9, 9))
+        elif kind == 5:
+            yield InitialPose(now, *place(), rng.uniform(-9.0, 9.0), (a, 0.0, a, 0.0, 0.0, b))
         else:
             yield BeliefShared(now)
 

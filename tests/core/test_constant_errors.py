@@ -23,7 +23,7 @@ from cpcbl_team.constant_errors import (
 )
 from cpcbl_team.estimate import ZERO3, Covariance3, Estimate, Row
 from cpcbl_team.geometry import Pose2, step, wrap_angle
-from cpcbl_team.miscalibration import BLOCK_NS, Corrected, ModelCheck, check_models
+from cpcbl_team.miscalibration import BLOCK_NS, Corrected, ModelCheck, after_path, check_models
 from cpcbl_team.motion import move
 
 NOISE = OdometryNoise()
@@ -59,7 +59,8 @@ def test_the_sensitivity_is_what_a_small_error_leads_to(column: int) -> None:
     true = believed = Pose2(1.0, 2.0, 0.3)
     for distance, turn in ((0.4, 0.5), (0.3, -0.2)):
         course = believed.heading + 0.5 * turn
-        sensitivity = sensitivity_after(sensitivity, distance, turn, course)
+        dx, dy = distance * math.cos(course), distance * math.sin(course)
+        sensitivity = sensitivity_after(sensitivity, dx, dy, turn)
         moved = distance * (1.0 + errors[0]), turn * (1.0 + errors[1])
         # the heading that biased bearings give is smaller than the one in which the robot drives
         ahead = step(Pose2(true.x, true.y, true.heading + errors[2]), *moved)
@@ -186,17 +187,16 @@ def test_a_block_knows_the_path_of_its_robot() -> None:
     pieces = [(0.0, 0.1)] * 10 + [(0.04, 0.0)] * 10
     exact = estimate = Estimate(Pose2(1.0, 2.0, 0.3), diagonal(0.01, 0.01))
     place = Pose2(0.0, 0.0, 0.0)
-    steps = ModelCheck().from_pose(Corrected(0, estimate, place, 0))
+    begin = Corrected(0, estimate, place, 0)
+    check = ModelCheck().from_pose(begin)
     for i, piece in enumerate(pieces, 1):
         exact, place = move(exact, *piece, NOISE), step(place, *piece)
-        if i % 5 == 0:
-            steps = steps.with_step(i * BLOCK_NS // 20, place, NOISE)
-    once = ModelCheck().from_pose(Corrected(0, estimate, Pose2(0.0, 0.0, 0.0), 0))
-    once = once.with_step(BLOCK_NS, place, NOISE)
-    assert steps.ahead is not None
-    assert once.ahead is not None
-    assert steps.ahead.estimate.pose == pytest.approx(exact.pose, abs=0.001)
-    found = matrix3(steps.ahead.estimate.covariance)
+        if i % 5 == 0 and i < len(pieces):
+            check = check.with_place(i * BLOCK_NS // 20, place)
+    by_steps, _ = after_path(begin, check, place, NOISE)
+    by_one, _ = after_path(begin, check.from_pose(begin), place, NOISE)
+    assert by_steps.pose == pytest.approx(exact.pose, abs=0.001)
+    found = matrix3(by_steps.covariance)
     assert found == pytest.approx(matrix3(exact.covariance), rel=0.05, abs=1e-5)
-    by_one = np.linalg.eigvalsh(matrix3(once.ahead.estimate.covariance))
-    assert by_one[0] < 0.85 * np.linalg.eigvalsh(matrix3(exact.covariance))[0]
+    least = np.linalg.eigvalsh(matrix3(by_one.covariance))
+    assert least[0] < 0.85 * np.linalg.eigvalsh(matrix3(exact.covariance))[0]

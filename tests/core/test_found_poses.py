@@ -110,19 +110,23 @@ def test_a_pose_is_found_only_where_the_evidence_determines_it(
 @lru_cache
 def carried_away(
     seed: int, gives: Gives, count: int, variant: Variant = "joint", seconds: int = 16
-) -> tuple[State, Pose2]:
-    """Carried off from where it knew its pose well; then it drives a circle and sees landmarks."""
+) -> tuple[State, Pose2, list[float]]:
+    """Carried off from where it knew its pose well; then it drives a circle and sees landmarks. The
+    state and the true pose at the end, and the NEES of each pose when it was no longer lost."""
     rng, field = np.random.default_rng(seed), giving(gives, CORNERS[:count])
     robot = localizer(variant, field, sensor=SENSOR, odometry=NOISE)
     noise = sensor_noise(rng, SENSOR)
     state = state_at(Pose2(2.0, 1.5, 0.0), diagonal_of(0.08, 0.03))
     true, now = Pose2(rng.uniform(4.5, 6.0), rng.uniform(3.0, 4.5), rng.uniform(2.0, 4.5)), 0
+    found = []
     for _ in range(seconds * 5):
         true = noisy_step(true, 0.1, 0.07, rng)
         state = robot.add_odometry(state, Odometry(now, now + SECOND // 5, 0.1, 0.07))
-        now += SECOND // 5
+        now, was_lost = now + SECOND // 5, state.lost
         state = robot.cycle(state, frame(true, now, field=field, noise=noise))
-    return state, true
+        if was_lost and not state.lost:
+            found.append(pose_nees(state.estimate, true))
+    return state, true, found
 
 
 LONG = [
@@ -137,6 +141,7 @@ LONG = [
     ("gives", "count", "variant"),
     [
         ("bearing", 2, "joint"),
+        ("range", 1, "joint"),
         ("range", 2, "joint"),
         ("range", 2, "oval"),
         ("range", 2, "circular"),
@@ -152,12 +157,39 @@ LONG = [
 def test_a_robot_that_was_carried_away_is_found_or_lost(
     gives: Gives, count: int, variant: Variant, seeds: range
 ) -> None:
-    """Two readings a frame open its gates somewhere, but say nothing of where it is."""
-    wrong = 0
+    """Two readings a frame open its gates somewhere, but say nothing of where it is. And what they
+    accept while the window of rejections passes may be ranges that fit a wrong heading."""
+    wrong, found_wrong = 0, 0
     for seed in seeds:
-        state, true = carried_away(seed, gives, count, variant)
+        state, true, found = carried_away(seed, gives, count, variant)
         wrong += not state.lost and pose_nees(state.estimate, true) > POSE_BOUND
-    assert wrong == 0
+        found_wrong += sum(nees > POSE_BOUND for nees in found)
+    assert (wrong, found_wrong) == (0, 0)
+
+
+def test_ranges_that_its_gates_accept_do_not_confirm_a_heading() -> None:
+    """All ranges agree with its position again, before it has inflated its covariance."""
+    _, _, found = carried_away(53, "range", 4)
+    assert [nees > POSE_BOUND for nees in found] == [False]
+
+
+@pytest.mark.parametrize(
+    ("count", "rejected", "is_lost"), [(1, 3, True), (1, 2, False), (2, 3, False)]
+)
+def test_a_robot_that_measures_ranges_to_one_landmark_is_lost_as_soon_as_it_doubts_its_pose(
+    count: int, rejected: int, is_lost: bool
+) -> None:
+    """Nothing that it measures can dispel the doubt."""
+    here, pieces = Pose2(2.0, 1.5, 0.0), []
+    for i in range(1, 9):
+        exact = piece(i * SPACING_NS, here, f"m{i % count}", *CORNERS[i % count])
+        pieces.append(exact._replace(bearing_rad=None, odometry_from_robot=here))
+    memory = Memory(RecoveryMemory(evidence=tuple(pieces), suspected_ns=0))
+    doubtful = Updates(innovations=with_innovations(1, 20 - rejected, rejected, 20))
+    state = state_at(here, diagonal_of(0.05, 0.05), pieces[-1].stamp_ns)
+    robot = localizer(field=giving("range", CORNERS[:count]))
+    after = robot.recovery.check(state._replace(memory=memory, updates=doubtful))
+    assert bool(after.lost) is is_lost
 
 
 def test_a_robot_with_two_readings_a_frame_says_why_it_stays_lost() -> None:

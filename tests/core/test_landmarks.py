@@ -31,7 +31,7 @@ from cpcbl_team.estimate import (
     with_circular_position,
 )
 from cpcbl_team.geometry import Pose2, wrap_angle
-from cpcbl_team.inputs import Sighting, Sightings
+from cpcbl_team.inputs import MarkerSighting, Sighting, Sightings
 from cpcbl_team.localizer import Localizer
 from cpcbl_team.measurements import (
     Measurement,
@@ -236,3 +236,14 @@ def test_a_ray_to_an_object_behind_says_nothing() -> None:
     behind = Sightings(NOW, (Sighting("post", None, 2.0),))
     after = robot.cycle(state._replace(updates=updates), behind)
     assert after.estimate == state.estimate
+
+
+def test_a_teammate_s_marker_is_seen_beside_landmarks() -> None:
+    """Its sighting has more numbers than those of landmarks have."""
+    name, place = next(iter(CORNERS.landmarks.items()))
+    seen = point_sighting(LOOP_START, name, place.x_m, place.y_m)
+    marker = MarkerSighting("mate", 1.0, 0.1, 0.1, 0.1, 0.2, 0.1, heading_per_focal=0.5)
+    state = state_at(LOOP_START, diagonal(0.1, 0.1), NOW)
+    after = localizer().cycle(state, Sightings(NOW, (marker, seen)))
+    assert after.estimate == localizer().cycle(state, Sightings(NOW, (seen,))).estimate
+    assert after.estimate != state.estimate

@@ -4,10 +4,11 @@ from collections.abc import Sequence
 
 import pytest
 from msgspec.structs import replace
-from support.core import SECOND, diagonal, localizer, state_at
+from support.core import SECOND, diagonal, frame, localizer, state_at
 from support.standing import ORIGIN, STANDING, probabilistic, variants
 
 from cpcbl_team.config import OdometrySettings, Variant
+from cpcbl_team.geometry import Pose2
 from cpcbl_team.inputs import Odometry
 from cpcbl_team.localizer import Localizer
 from cpcbl_team.state import State
@@ -184,3 +185,14 @@ def test_after_lost_odometry_the_heading_is_in_doubt_too() -> None:
     ]
     within = 0.3**2 * 0.5**2
     assert variances == pytest.approx([0.3**2 * 0.2**2, within, within + 0.3**2 + 0.5**2])
+
+
+@pytest.mark.parametrize(("way", "is_kept"), [(0.5, False), (0.0, True)])
+def test_evidence_from_before_a_drive_without_odometry_is_void(way: float, is_kept: bool) -> None:
+    """Dead reckoning does not lead from there to the present pose; but who stood stands there."""
+    robot = localizer()
+    state = robot.add_odometry(state_at(ORIGIN, diagonal(0.1, 0.05)), Odometry(0, SECOND, way, 0.0))
+    state = robot.cycle(state, frame(Pose2(way, 0.0, 0.0), SECOND))
+    assert robot.recovery.evidence(state.memory.recovery)
+    state = robot.predict(state, 3 * SECOND)
+    assert bool(robot.recovery.evidence(state.memory.recovery)) is is_kept

@@ -209,8 +209,11 @@ def test_a_gap_makes_the_heading_uncertain_too() -> None:
     assert (distance, turn) == pytest.approx((1.0, 0.4))
     assert (more.distance, more.turn) == pytest.approx((0.09, 0.09))
     after = inflate_by_gap(Estimate(ORIGIN, diagonal(0.0, 0.0)), SECOND, before, 0.3)
-    assert after.covariance.hh == pytest.approx(0.09 + 0.16)
-    assert after.covariance.xx == after.covariance.yy == pytest.approx(0.09 + 1.0)
+    c = after.covariance  # who drove may turn since then
+    assert c.xx == c.yy == c.hh == pytest.approx(0.09 + 1.0)
+    turned = Odometry(0, SECOND, 0.0, 1.5)
+    c = inflate_by_gap(Estimate(ORIGIN, diagonal(0.0, 0.0)), SECOND, turned, 0.3).covariance
+    assert c.xx == c.yy == c.hh == pytest.approx(0.09 + 2.25)
 
 
 # Repeated use, exact sensors ----------------------------------------------------------------------

@@ -60,7 +60,7 @@ VICTIM, MATE = "victim", "mate"  # the fuzzer plays the mate
 DRIVEN = "patrol"  # the field refuses its commands, because they name the mate
 TO_FIELD = (topics.DRIVE, topics.JOIN)
 TO_PEOPLE = (topics.STATUS, topics.TRACK, topics.TRUTH, topics.LOOK, topics.POSE)
-ACCEPTED = ("odometry", "sightings", "position", "messages_received")
+ACCEPTED = ("odometry", "sightings", "position", "initial_pose", "messages_received")
 FRAME_REASONS = (
     "frame_skipped",
     "no_camera",

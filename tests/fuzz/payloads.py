@@ -6,7 +6,7 @@ from typing import Any
 
 import msgspec
 
-from cpcbl_team.inputs import Belief, Fix, Odometry, Position, Sighting, Sightings
+from cpcbl_team.inputs import Belief, Fix, InitialPose, Odometry, Position, Sighting, Sightings
 from cpcbl_transport import topics
 from cpcbl_transport.compact import encode_help
 from cpcbl_transport.messages import (
@@ -27,7 +27,7 @@ from cpcbl_transport.topics import Topic
 
 COVARIANCE_2, COVARIANCE_3 = (0.04, 0.01, 0.09), (0.04, 0.01, 0.09, 0.0, 0.0, 0.01)
 TAGS = (
-    *("odometry", "sightings", "position", "frame", "look"),
+    *("odometry", "sightings", "position", "initial_pose", "frame", "look"),
     *("status", "track", "pose", "drive", "truth", "join"),
 )
 LONGEST = 600
@@ -58,6 +58,8 @@ def valid_payload(topic: Topic, target: str, speaker: str, now_ns: int) -> bytes
             return encode(Sightings(now_ns, (Sighting(speaker, 2.0, 0.1), Sighting("oak", 3.0))))
         case topics.IN_POSITION:
             return encode(Position(now_ns, 1.0, 2.0, COVARIANCE_2))
+        case topics.IN_INITIAL_POSE:
+            return encode(InitialPose(now_ns, 1.0, 2.0, 0.5, COVARIANCE_3))
         case topics.IN_FRAME:
             return encode(Frame(now_ns, b"a picture"))
         case topics.LOOK:

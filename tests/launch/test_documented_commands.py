@@ -130,6 +130,7 @@ WAYS = {
     ),
     "cpcbl-team experiment table1 --seeds 20": Way(EXPERIMENT, "long", "--seeds 2"),
     "cpcbl-team experiment worlds": Way(EXPERIMENT, "long", "--seeds 1"),
+    "cpcbl-team bridge access team.toml > access.json5": Way("access_control"),
     "cpcbl-team bridge ros2 team.toml": LIVE._replace(says="in ROS 2 at", beside="router"),
     "cpcbl-team gateway team.toml": LIVE._replace(
         says="gateway of team lab", more="--listen :0", beside="router"

@@ -20,6 +20,11 @@ def adopt_orphans() -> None:
 
 def children() -> dict[int, str]:
     """Process id and command of every living descendant of this process."""
+    if sys.platform == "linux":  # where each of them is a child, or below one
+        try:
+            os.waitid(os.P_ALL, 0, os.WEXITED | os.WNOHANG | os.WNOWAIT)
+        except ChildProcessError:
+            return {}
     listed = subprocess.run(
         ["ps", "-ww", "-eo", "pid=,ppid=,stat=,args="], capture_output=True, text=True, check=True
     )

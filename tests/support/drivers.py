@@ -11,7 +11,7 @@ from cpcbl_agents.node import Node, NodeCallbacks, NodeStart
 from cpcbl_agents.robot import build_robot
 from cpcbl_team.config import Field, Landmark, PositionSensor, Team
 from cpcbl_team.geometry import Pose2, step, wrap_angle
-from cpcbl_team.inputs import Odometry, Position, Sighting, Sightings
+from cpcbl_team.inputs import InitialPose, Odometry, Position, Sighting, Sightings
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Publisher
 from cpcbl_transport.memory_bus import MemoryHub
@@ -27,6 +27,7 @@ TOPICS = {
     Odometry: topics.IN_ODOMETRY,
     Sightings: topics.IN_SIGHTINGS,
     Position: topics.IN_POSITION,
+    InitialPose: topics.IN_INITIAL_POSE,
     Frame: topics.IN_FRAME,
 }
 PLACES = {"door": (5.0, 1.0), "desk": (4.0, -4.0), "lamp": (-4.0, 3.0), "sink": (-2.0, -5.0)}
@@ -92,6 +93,10 @@ class DrivenRobot:
         until_ns = self.now_ns + round(seconds * SECOND)
         while self.now_ns < until_ns:
             self._tick(change)
+
+    def put(self, message: SensorInput) -> None:
+        """Gives the robot another input, at once."""
+        self._publishers[type(message)].put(encode(message))
 
     def _tick(self, change: Change) -> None:
         self.now_ns += TICK_NS

@@ -4,7 +4,7 @@ import msgspec
 
 from cpcbl_team.config.sensors import PositionSensorModel
 from cpcbl_team.config.team import StartModel
-from cpcbl_team.inputs import Belief, Fix, Odometry, Position, Sighting, Sightings
+from cpcbl_team.inputs import Belief, Fix, InitialPose, Odometry, Position, Sighting, Sightings
 from cpcbl_transport.messages import (
     AnnotatedFrame,
     Drive,
@@ -30,6 +30,7 @@ COVARIANCE = (0.04, 0.01, 0.09, 0.0, 0.0, 0.01)
 ODOMETRY = Odometry(NOW - SECOND, NOW, 0.5, 0.1)
 SIGHTINGS = Sightings(NOW, (Sighting("oak", 2.0, 0.1), Sighting("elm", None, -0.5, None, 0.02)))
 POSITION = Position(NOW, 1.0, 2.0, (0.0004, 0.0, 0.0009))
+INITIAL_POSE = InitialPose(NOW, 1.0, 2.0, 0.5, COVARIANCE)
 JPEG = bytes(range(256))
 FRAME = Frame(NOW, JPEG)
 MATE_SEEN = Sighting("r2", 2.0, 0.1, 0.02, 0.003, -1.5, 0.05)
@@ -53,7 +54,10 @@ DRIVE = Drive("r1", NOW, 0.5, 0.1)
 MODEL = SimulatedRobotModel(StartModel(x_m=1.0, y_m=2.0), position_sensor=PositionSensorModel())
 JOIN = Join("tripod", "a", NOW, MODEL)
 TRUTHS = Truths(NOW, (Truth("r1", 1.0, 2.0, 0.5, 1), Truth("r2", 3.0, 4.0, -0.5)))
-VALID = (ODOMETRY, SIGHTINGS, POSITION, FRAME, LOOK, STATUS, TRACK, POSE, DRIVE, JOIN, TRUTHS)
+VALID = (
+    *(ODOMETRY, SIGHTINGS, POSITION, INITIAL_POSE, FRAME),
+    *(LOOK, STATUS, TRACK, POSE, DRIVE, JOIN, TRUTHS),
+)
 BELIEF = Belief("r1", NOW, 1.0, 2.0, 0.5, COVARIANCE, 0.25, -0.1)
 FIX = Fix("r2", "r1", NOW, 1.5, -2.5, (0.04, 0.01, 0.09), (0.01, 0.0, 0.02))
 HEADED_FIX = msgspec.structs.replace(

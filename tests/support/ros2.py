@@ -18,6 +18,7 @@ from cpcbl_transport.ros2.messages import MessageTypes
 from cpcbl_transport.ros2.names import Distribution
 
 MS = 1_000_000
+OPTICAL = (-0.5, 0.5, -0.5, 0.5)  # x right, y down, z ahead, in the axes of a body (REP 103)
 T0 = 1_700_000_000_000_000_000
 TEAM = """
 name = "lab"
@@ -112,6 +113,19 @@ def pose_stamped(
         header=header_fields(stamp_ns, frame),
         pose={"pose": pose_fields(pose), "covariance": covariance},
     )
+
+
+def static(
+    parent: str, child: str, point: Any = (0.0, 0.0, 0.0), turn: Any = (0.0, 0.0, 0.0, 1.0)
+) -> dict[str, Any]:
+    return {
+        "header": header_fields(T0, parent),
+        "child_frame_id": child,
+        "transform": {
+            "translation": dict(zip("xyz", map(float, point), strict=True)),
+            "rotation": dict(zip("xyzw", map(float, turn), strict=True)),
+        },
+    }
 
 
 def arc(speed_m_s: float, turn_rate_rad_s: float, seconds: float, start: Pose2) -> Pose2:

@@ -63,6 +63,7 @@ def test_every_target_and_beliefs_have_a_rate_and_every_key_a_size() -> None:
         "cpcbl/tests/in/*/odometry": 999,
         "cpcbl/tests/in/*/sightings": 999,
         "cpcbl/tests/in/*/position": 999,
+        "cpcbl/tests/in/*/initial_pose": 999,
         "cpcbl/tests/in/*/frame": 99_999,
         "cpcbl/tests/look/*": 99_999,
         "cpcbl/tests/field/drive/*": 999,

@@ -23,7 +23,7 @@ from support.messages import (
 
 from cpcbl_team.config.sensors import OdometryModel, PositionSensorModel, SensorModel
 from cpcbl_team.config.team import StartModel
-from cpcbl_team.inputs import Odometry, Position, Sighting, Sightings
+from cpcbl_team.inputs import InitialPose, Odometry, Position, Sighting, Sightings
 from cpcbl_transport.messages import (
     FUTURE_NS,
     LARGEST_FRAME,
@@ -83,6 +83,7 @@ MESSAGES: dict[type[Any], st.SearchStrategy[Tagged]] = {
     Odometry: st.builds(Odometry, STAMPS, STAMPS, FLOATS, FLOATS),
     Sightings: st.builds(Sightings, STAMPS, SIGHTED),
     Position: st.builds(Position, STAMPS, FLOATS, FLOATS, COVARIANCES_2),
+    InitialPose: st.builds(InitialPose, STAMPS, *[FLOATS] * 3, COVARIANCES_3),
     Frame: st.builds(Frame, STAMPS, st.binary(max_size=200)),
     AnnotatedFrame: st.builds(
         AnnotatedFrame,

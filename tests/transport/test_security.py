@@ -44,13 +44,14 @@ from cpcbl_transport.zenoh_config import router_config
 
 OWN_ROBOT = {
     *("belief/3/r1", "fix/r2/3/r1", "status/r1", "track/r1", "look/r1", "field/drive/r1"),
-    *("in/r1/odometry", "in/r1/sightings", "in/r1/position", "in/r1/frame"),
+    *("in/r1/odometry", "in/r1/sightings", "in/r1/position", "in/r1/initial_pose", "in/r1/frame"),
     *("pose/r1", "pose/r1/json", "status/r1/json"),
 }
 OWN_OBSERVER = {
     *("belief/3/tripod", "fix/r1/3/tripod", "fix/r2/3/tripod", "status/tripod", "track/tripod"),
     *("field/join/tripod", "field/drive/tripod"),  # its own body on the simulated field
     *("in/tripod/odometry", "in/tripod/sightings", "in/tripod/position"),
+    "in/tripod/initial_pose",
     *("look/tripod", "in/tripod/frame", "pose/tripod", "pose/tripod/json", "status/tripod/json"),
 }
 OWN_FIELD = {
@@ -58,6 +59,7 @@ OWN_FIELD = {
     *(f"in/{name}/odometry" for name in ("r1", "r2", "tripod")),
     *(f"in/{name}/sightings" for name in ("r1", "r2", "tripod")),
     *(f"in/{name}/position" for name in ("r1", "r2", "tripod")),
+    *(f"in/{name}/initial_pose" for name in ("r1", "r2", "tripod")),
     *(f"in/{name}/frame" for name in ("r1", "r2", "tripod")),
 }
 KEYS = sorted(
@@ -212,7 +214,8 @@ def test_permitted_subscriptions_follow_the_table_too() -> None:
     assert set(subscribe_keys(me)) == {
         *("alive/*/*/*", "belief/*/*", "fix/me/*/*", "status/me", "track/me", "look/me"),
         *("pose/*", "pose/*/json", "status/me/json"),
-        *("in/me/odometry", "in/me/sightings", "in/me/position", "in/me/frame"),
+        *(f"in/me/{name}" for name in ("odometry", "sightings", "position", "frame")),
+        "in/me/initial_pose",
         "ran/me/*/*",
     }
     assert subscribe_keys(Identity(Role.OBSERVER, "me")) == subscribe_keys(me)

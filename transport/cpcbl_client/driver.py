@@ -9,13 +9,19 @@ from typing import Self
 from cpcbl_client.connection import SILENT_S, Connection, Reminder, log
 from cpcbl_client.team import ClientTeam, name_hint, read_team
 from cpcbl_team.errors import InputError
-from cpcbl_team.inputs import Odometry, Position, Sighting, Sightings
+from cpcbl_team.inputs import InitialPose, Odometry, Position, Sighting, Sightings
 from cpcbl_transport.bus import Bus, Publisher
 from cpcbl_transport.messages import LONGEST_ODOMETRY_NS, Frame, SensorInput, encode
 from cpcbl_transport.security import Identity
 from cpcbl_transport.topics import Role, topic_of
-from cpcbl_transport.units import odometry_problem, sighting_problem, stamp_problem
+from cpcbl_transport.units import (
+    initial_pose_problem,
+    odometry_problem,
+    sighting_problem,
+    stamp_problem,
+)
 
+TAKEN_WITHIN_S = 2.0
 PoseXYH = tuple[float, float, float]
 
 
@@ -117,6 +123,30 @@ class Driver:
         place = float(x_m), float(y_m), (variance, 0.0, variance)
         self._put(Position(self._stamp(stamp_ns), *place))
 
+    def initial_pose(
+        self,
+        x_m: float,
+        y_m: float,
+        heading_rad: float,
+        sigma_m: float = 0.5,
+        heading_sigma_rad: float = math.radians(15.0),
+        *,
+        stamp_ns: int | None = None,
+    ) -> None:
+        """Where the robot is, as somebody says: it replaces what the robot believed. The σ are
+        those of RViz, where a person gives the pose with the mouse. Waits until a robot takes it,
+        at most 2 s: it is sent once."""
+        p, h = float(sigma_m) ** 2, float(heading_sigma_rad) ** 2
+        pose = float(x_m), float(y_m), float(heading_rad)
+        given = InitialPose(self._stamp(stamp_ns), *pose, (p, 0.0, p, 0.0, 0.0, h))
+        _require(initial_pose_problem(given))
+        publisher, until_s = self._publisher(InitialPose), time.monotonic() + TAKEN_WITHIN_S
+        while not publisher.matching and time.monotonic() < until_s:
+            time.sleep(0.01)
+        if not publisher.matching:
+            log.warning("nobody sets the pose: no robot %s takes it", self._robot)
+        self._put(given)
+
     def frame(self, image: bytes, *, stamp_ns: int | None = None) -> None:
         """A camera image (JPEG or PNG) at the time of its exposure."""
         self._put(Frame(self._stamp(stamp_ns), image))
@@ -138,8 +168,7 @@ class Driver:
         _require(stamp_problem(stamp_ns, now_ns))
         return stamp_ns
 
-    def _put(self, message: SensorInput) -> None:
-        kind = type(message)
+    def _publisher(self, kind: type[SensorInput]) -> Publisher:
         if kind not in self._publishers:
             topic = topic_of(kind)
             key = topic.at(robot=self._robot)
@@ -147,7 +176,11 @@ class Driver:
             self._reminders[kind] = Reminder(SILENT_S)
             # A session does not receive what it publishes itself
             self._connection.bus.subscribe(key, lambda key, payload: self._others.add(key))
-        self._publishers[kind].put(encode(message))
+        return self._publishers[kind]
+
+    def _put(self, message: SensorInput) -> None:
+        kind = type(message)
+        self._publisher(kind).put(encode(message))
         if self._connection.check():
             self._check_listener(kind)
 

@@ -15,7 +15,17 @@ import msgspec
 
 from cpcbl_team.config.sensors import OdometryModel, PositionSensorModel, SensorModel
 from cpcbl_team.config.team import RobotSettings, StartModel
-from cpcbl_team.inputs import Belief, Fix, Name, Odometry, Position, Sighting, Sightings
+from cpcbl_team.initial_pose import is_covariance
+from cpcbl_team.inputs import (
+    Belief,
+    Fix,
+    InitialPose,
+    Name,
+    Odometry,
+    Position,
+    Sighting,
+    Sightings,
+)
 
 VERSION = 2
 FUTURE_NS = 500_000_000
@@ -94,7 +104,7 @@ class Trust(msgspec.Struct, frozen=True, array_like=True):
 class InputHealth(msgspec.Struct, frozen=True, array_like=True):
     """What a robot received on one of its inputs, since its process started."""
 
-    input: str  # odometry, sightings, position or frame
+    input: str  # odometry, sightings, position, initial_pose or frame
     rate_hz: float = 0.0  # of the last seconds, with what was refused
     latest_ns: int = 0  # the newest stamp that was taken; 0 before the first
     taken: int = 0
@@ -226,11 +236,16 @@ class Truths(msgspec.Struct, frozen=True, array_like=True, tag="truth"):
 
 
 Help = Belief | Fix
-SensorInput = Odometry | Sightings | Position | Frame
+SensorInput = Odometry | Sightings | Position | InitialPose | Frame
 Tagged = SensorInput | AnnotatedFrame | Status | Track | Pose | Drive | Join | Truths
 Message = Tagged | Help
 Outgoing = AnnotatedFrame | Track | Drive | Help  # what a robot sends besides its status
 Telemetry = Status | Track | Pose | Drive | Truths
+
+
+def input_name(message: SensorInput) -> str:
+    """The name of an input: in its key, in counts and in a status."""
+    return str(message.__struct_config__.tag)
 
 
 class Refusal(StrEnum):
@@ -316,6 +331,8 @@ def refusal(message: Message, now_ns: int) -> Refusal | None:
         xx, xy, yy = message.covariance
         if not (xx > 0.0 and yy > 0.0 and xy * xy <= xx * yy * (1.0 + 1e-6) + 1e-12):
             return Refusal.NOT_A_COVARIANCE
+    if isinstance(message, InitialPose) and not is_covariance(message.covariance):
+        return Refusal.NOT_A_COVARIANCE
     return None
 
 

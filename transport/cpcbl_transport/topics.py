@@ -11,7 +11,7 @@ from enum import Enum, StrEnum
 from functools import lru_cache
 from typing import NamedTuple
 
-from cpcbl_team.inputs import Belief, Fix, Odometry, Position, Sightings
+from cpcbl_team.inputs import Belief, Fix, InitialPose, Odometry, Position, Sightings
 from cpcbl_transport import messages
 from cpcbl_transport.messages import LARGEST_FRAME, LARGEST_PAYLOAD, Message
 
@@ -158,6 +158,8 @@ POSE = Topic("pose/<robot>", messages.Pose, Qos.TELEMETRY, subscribers=_READERS,
 IN_ODOMETRY = Topic("in/<robot>/odometry", Odometry, Qos.INPUT, publishers=_SENSING)
 IN_SIGHTINGS = Topic("in/<robot>/sightings", Sightings, Qos.INPUT, publishers=_SENSING)
 IN_POSITION = Topic("in/<robot>/position", Position, Qos.INPUT, publishers=_SENSING)
+# Whenever somebody sets the pose of a robot. It must arrive: the person sees whether it has
+IN_INITIAL_POSE = Topic("in/<robot>/initial_pose", InitialPose, Qos.INPUT, publishers=_SENSING)
 # At the camera's rate. The next frame is better than a late one
 IN_FRAME = Topic(
     "in/<robot>/frame", messages.Frame, Qos.FRAME, publishers=_SENSING, largest=LARGEST_FRAME
@@ -176,10 +178,11 @@ TRUTH = Topic("field/truth", messages.Truths, Qos.TELEMETRY, publishers=_FIELD, 
 
 TOPICS = (
     *(ALIVE, RAN, BELIEF, FIX, STATUS, TRACK, POSE),
-    *(IN_ODOMETRY, IN_SIGHTINGS, IN_POSITION, IN_FRAME, LOOK),
+    *(IN_ODOMETRY, IN_SIGHTINGS, IN_POSITION, IN_INITIAL_POSE, IN_FRAME, LOOK),
     *(DRIVE, JOIN, TRUTH),
 )
-INPUTS = (IN_ODOMETRY, IN_SIGHTINGS, IN_POSITION, IN_FRAME)
+INPUTS = (IN_ODOMETRY, IN_SIGHTINGS, IN_POSITION, IN_INITIAL_POSE, IN_FRAME)
+"""The last part of each key is the tag of its message."""
 COLLABORATION = (Belief, Fix)
 _BY_TYPE: dict[type[object], Topic] = {
     topic.carries: topic for topic in TOPICS if topic.carries is not None

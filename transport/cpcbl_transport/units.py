@@ -6,7 +6,7 @@ number is left to the robot, which refuses and counts it: a NaN of a sensor must
 
 import math
 
-from cpcbl_team.inputs import Sighting
+from cpcbl_team.inputs import InitialPose, Sighting
 
 DAY_NS = 86_400 * 10**9
 SCALES = {"seconds": 10**9, "milliseconds": 10**6, "microseconds": 10**3}
@@ -47,4 +47,11 @@ def sighting_problem(seen: Sighting) -> str:
             return f"sighting of {seen.id!r}: {name}={angle:g}: looks like degrees; write radians"
     if seen.range_m is not None and seen.range_m > FARTHEST_M:
         return f"sighting of {seen.id!r}: range_m={seen.range_m:g}: looks like mm; write metres"
+    return ""
+
+
+def initial_pose_problem(given: InitialPose) -> str:
+    """A heading must be within two turns, as bearings."""
+    if abs(given.heading_rad) > 2.0 * math.pi:
+        return f"heading_rad={given.heading_rad:g}: looks like degrees; write radians"
     return ""

@@ -28,7 +28,7 @@ from cpcbl_agents.input_diagnosis.unusual_motion import UnusualMotion
 from cpcbl_agents.robot import InputSnapshot
 from cpcbl_team.config import RobotSettings, Start, Team
 from cpcbl_team.geometry import Pose2, wrap_angle
-from cpcbl_team.inputs import Odometry, Sightings
+from cpcbl_team.inputs import InitialPose, Odometry, Sightings
 from cpcbl_transport import topics
 from cpcbl_transport.messages import (
     LARGEST_FRAME,
@@ -154,6 +154,7 @@ class InputMonitor:
             moves=settings.odometry.moves,
             now_ns=start_ns,
         )
+        self._initial_pose: InitialPose | None = None
         self._hysteresis, self._implausible = ProblemHysteresis(), tuple[str, ...]()
         self.are_mended = self._are_wrong = False
         """Whether inputs were wrong before the last judgement, and are right."""
@@ -192,6 +193,9 @@ class InputMonitor:
         """The health of each input that anything came on or is expected on, and the problems. To
         be called once a second. `namesake`: whether another process has this robot's name."""
         odometry = self.inputs["odometry"]
+        if snapshot.initial_pose is not self._initial_pose:
+            self._initial_pose = snapshot.initial_pose
+            self._note_initial_pose(now_ns)
         self.has_moved |= abs(odometry.distance_m) > MOVED_M or abs(odometry.turn_rad) > TURNED_RAD
         totals = self._totals(snapshot.refused, now_ns)
         if now_ns - self._start_ns >= SETTLED_NS:
@@ -224,6 +228,17 @@ class InputMonitor:
         said = (*problems, *self._implausible)
         jumps = self._jumps.judge(snapshot.jump, self.inputs["odometry"].steps, now_ns)
         return health, said or jumps
+
+    def _note_initial_pose(self, now_ns: int) -> None:
+        """Somebody has set the pose: it is no longer that of the team file, by which nothing is
+        judged any more, nor is it where a process that is started again would begin."""
+        given = self._initial_pose
+        assert given is not None
+        self.has_moved, self._facts = True, self._facts._replace(start=None)
+        if self._sees:
+            xx, _, yy, _, _, hh = given.covariance
+            sigmas = math.sqrt(max(xx, yy)), math.degrees(math.sqrt(hh))
+            self._confirmation.restart(_is_sure(*sigmas), now_ns)
 
     def _with_latest(
         self, snapshot: InputSnapshot, facts: InputFacts, before_ns: int
@@ -363,10 +378,15 @@ def _expected_inputs(settings: RobotSettings) -> Iterator[str]:
         yield "position"
 
 
+def _is_sure(sigma_m: float, heading_sigma_deg: float) -> bool:
+    """Whether a stated pose is known well enough to judge inputs by it."""
+    return sigma_m <= SURE_M and heading_sigma_deg <= SURE_DEG
+
+
 def _start_pose(start: Start | None) -> Pose2 | None:
     """The start, if it is known well enough to judge inputs by it."""
     if start is None or not start.known:
         return None
-    if start.sigma_m > SURE_M or start.heading_sigma_deg > SURE_DEG:
+    if not _is_sure(start.sigma_m, start.heading_sigma_deg):
         return None
     return Pose2(start.x_m, start.y_m, math.radians(start.heading_deg))

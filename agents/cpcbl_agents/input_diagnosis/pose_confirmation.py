@@ -50,6 +50,11 @@ class PoseConfirmation:
         self._has_seen: bool | None = None  # a landmark; None until it is judged
         self._missing = "" if is_start_known else self._text(False)
 
+    def restart(self, is_known: bool, now_ns: int) -> None:
+        """Somebody has set the pose. `is_known`: so well that this confirms it."""
+        self._begin(now_ns)
+        self._missing = "" if is_known else self._text(False)
+
     @property
     def is_awaited(self) -> bool:
         """Whether the pose is still to be confirmed."""

@@ -72,8 +72,8 @@ REASONS = {
     "frame_repeated": "images repeat the one before exactly; the camera or its driver hangs",
     "camera_upside_down": "the camera is upside down",
     "frame_black": "images are black",
-    "frame_white": "images are white",
-    "frame_blank": "images are blank",
+    **{f"frame_{what}": f"images are {what}" for what in ("white", "blank")},
+    "off_field": "a pose that somebody gave is far from the map",
 }
 """What each reason of a refused input says to people; docs/refused_inputs.md has the remedies."""
 

@@ -1,5 +1,6 @@
 """The command that connects a team to what is no member of it."""
 
+import json
 from typing import Annotated
 
 import typer
@@ -9,6 +10,8 @@ from cpcbl_agents.clock import Clock
 from cpcbl_launch.commands import options
 from cpcbl_launch.team.file import find_team
 from cpcbl_launch.team.requirements import require_robots
+from cpcbl_transport.security import Identity
+from cpcbl_transport.topics import Role
 
 bridge_app = typer.Typer(
     help="Connect a team to other software.", no_args_is_help=True, pretty_exceptions_enable=False
@@ -18,6 +21,25 @@ bridge_app = typer.Typer(
 @bridge_app.callback()
 def _bridge() -> None:
     """Connect a team to other software."""
+
+
+@bridge_app.command("access")
+def access(
+    file: options.Team,
+    nodes: Annotated[
+        str,
+        Option(help="Common names of the certificates of robots' nodes; default: robot/r1, ..."),
+    ] = "",
+    bridge: Annotated[str, Option(help="Those of the bridge's certificates.")] = "bridge",
+) -> None:
+    """Print the access control of a router of ROS 2 (rmw_zenohd) that lets the bridge and robots'
+    nodes in, and nobody else."""
+    from cpcbl_launch.run.ros2.command import router_access
+
+    team = find_team(file)
+    robots = [str(Identity(Role.ROBOT, name)) for name in team.robots]
+    who = options.parse_names(bridge), options.parse_names(nodes) or robots
+    typer.echo(json.dumps({"access_control": router_access(team, *who)}, indent=2))
 
 
 @bridge_app.command("ros2")

@@ -27,7 +27,7 @@ from cpcbl_launch.reporting.recorder import truth_rows
 from cpcbl_launch.team.faults import one_line
 from cpcbl_launch.team.file import decode_resolved
 from cpcbl_team.config import Team
-from cpcbl_team.inputs import Odometry, Position, Sightings
+from cpcbl_team.inputs import InitialPose, Odometry, Position, Sightings
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus
 from cpcbl_transport.decoding import decode
@@ -44,7 +44,8 @@ from cpcbl_transport.messages import (
 log = logging.getLogger(__name__)
 
 RECORDED = (
-    *(topics.IN_ODOMETRY, topics.IN_SIGHTINGS, topics.IN_POSITION),  # not frames: they are large
+    *(topics.IN_ODOMETRY, topics.IN_SIGHTINGS, topics.IN_POSITION),
+    topics.IN_INITIAL_POSE,  # not frames: they are large
     *(topics.TRACK, topics.STATUS, topics.TRUTH, topics.LOOK),
 )
 TEAM = "team.json"
@@ -170,6 +171,6 @@ def read_recording(path: Path) -> RecordedRun:
     for key, message in messages:
         if isinstance(message, AnnotatedFrame):  # what the robot's eyes found in a frame
             message = Sightings(message.stamp_ns, message.found)
-        if isinstance(message, Odometry | Sightings | Position):
+        if isinstance(message, Odometry | Sightings | Position | InitialPose):
             inputs.setdefault(key.split("/")[1], []).append(message)
     return RecordedRun(team, inputs, truth_rows(truths))

@@ -23,6 +23,7 @@ log = logging.getLogger(__name__)
 
 PROGRAM = (sys.executable, "-m", "cpcbl_launch")
 ROBOT = "robot-"
+BRIDGE = ("bridge", "ros2")
 FIRST_BACKOFF_S = 0.5
 LONGEST_BACKOFF_S = 8.0
 HEALTHY_S = 10.0
@@ -42,7 +43,8 @@ class Task(NamedTuple):
 def tasks(
     team: Team, team_file: str, common: tuple[str, ...], seed: int, here: Collection[str]
 ) -> list[Task]:
-    """name | arguments | when: the field if any robot is simulated, one process a robot."""
+    """name | arguments | when: the field if any robot is simulated, one process a robot, the bridge
+    if the team file has a table `ros2`."""
     rows = [
         Task(ROBOT + name, ("robot", team_file, name, *common), Identity(Role.ROBOT, name))
         for name in team.robots
@@ -51,6 +53,9 @@ def tasks(
     if team.simulated:
         field = ("field", team_file, "--seed", str(seed), *common)
         rows.insert(0, Task("field", field, Identity(Role.FIELD)))
+    if team.ros2 is not None:
+        bridge = (*BRIDGE, team_file, *common, "--robots", ",".join(here))
+        rows.append(Task("bridge", bridge, bridge_identity(here)))
     return rows
 
 
@@ -77,8 +82,6 @@ def process_table(
     if team.gateway is not None:
         gateway = ("gateway", str(team_file), "--connect", endpoint, "--parent", str(os.getpid()))
         table.append(ProcessSpec("gateway", (*PROGRAM, *gateway)))
-    if team.ros2 is not None:
-        table.append(bridge_spec(str(team_file), [endpoint], str(clock), here))
     return table
 
 
@@ -87,7 +90,7 @@ def bridge_spec(
 ) -> ProcessSpec:
     """The bridge of these robots to ROS 2 as a process of this one. `clock`: robot time, empty for
     that of the machine."""
-    words = ["bridge", "ros2", team_file, "--parent", str(os.getpid())]
+    words = [*BRIDGE, team_file, "--parent", str(os.getpid())]
     words += [word for endpoint in connect for word in ("--connect", endpoint)]
     words += ["--clock", clock] if clock else []
     words += ["--robots", ",".join(robots)]

@@ -26,7 +26,6 @@ from cpcbl_launch.run.logged_team import is_calibrated_on
 from cpcbl_launch.run.processes import (
     Processes,
     Supervisor,
-    bridge_identity,
     process_table,
     tasks,
     use_one_heap,
@@ -142,8 +141,6 @@ def require_keys(team: Team, listen: Sequence[str], here: Collection[str]) -> No
         link_of(team, task.identity, listen)
     if team.gateway is not None:
         link_of(team, Identity(Role.GATEWAY), listen)
-    if team.ros2 is not None:
-        link_of(team, bridge_identity(here), listen)
 
 
 def free_endpoint(protocol: str = "tcp") -> str:

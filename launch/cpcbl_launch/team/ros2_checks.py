@@ -9,9 +9,10 @@ from cpcbl_transport.ros2.names import RosNameError, topic_name
 
 INPUTS = (
     *("odometry", "detections", "camera_info", "detections_3d", "ranges", "image"),
-    *("compressed_image", "navsat", "position"),
+    *("compressed_image", "navsat", "position", "initial_pose"),
 )
-OUTPUTS = ("pose", "pose_odometry")  # /tf is shared
+OUTPUTS = ("pose", "pose_odometry")
+SHARED = ("tf", "tf_static")  # by all robots, if they have one tree
 NEED_CAMERA = ("image", "compressed_image")
 
 
@@ -28,6 +29,11 @@ def ros2_problems(team: Team) -> Iterator[str]:
         if robot.ros2.navsat and ros2.datum is None:
             fix = "add ros2.datum with latitude_deg and longitude_deg"
             yield f"{key}.navsat: where is the field on the earth? {fix}"
+        if robot.ros2.map_frame and not robot.ros2.tf_static:
+            fix = "name its topic in tf_static, which says where it is"
+            yield f"{key}.map_frame: nothing connects it with {ros2.field_frame!r}; {fix}"
+        if robot.ros2.odometry_frame in (robot.ros2.map_frame, ros2.field_frame):
+            yield f"{key}.odometry_frame: is the field's frame too; give it its own"
         for image in NEED_CAMERA:
             if getattr(robot.ros2, image) and robot.sensing != "camera":
                 fix = 'set sensing = "camera", so that this software looks for objects in them'
@@ -80,14 +86,14 @@ def _topic_problems(team: Team, ros2: Ros2Settings) -> Iterator[str]:
     known: dict[str, str] = {}
     for name, robot in team.robots.items():
         driven = INPUTS if robot.source == "external" else ()
-        for key in (*driven, *OUTPUTS, "tf"):
+        for key in (*driven, *OUTPUTS, *SHARED):
             topic = getattr(robot.ros2, key)
             if not topic:
                 continue
             full, path = ros2.topic(name, topic), f"robots.{name}.ros2.{key}"
             faults = list(_name_problem(path, full))
             yield from faults
-            if faults or key == "tf":
+            if faults or key in SHARED:
                 continue
             if other := known.get(full):
                 fix = "put {robot} into ros2.namespace, or name it otherwise"

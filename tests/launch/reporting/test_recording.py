@@ -13,7 +13,7 @@ from cpcbl_launch.reporting.recording import Recording, read_recording
 from cpcbl_launch.simulation.in_process import simulate
 from cpcbl_launch.team.file import builtin_path, load_team
 from cpcbl_team.config import RobotSettings, Team
-from cpcbl_team.inputs import Odometry, Position, Sighting, Sightings
+from cpcbl_team.inputs import InitialPose, Odometry, Position, Sighting, Sightings
 from cpcbl_transport import topics
 from cpcbl_transport.memory_bus import MemoryHub
 from cpcbl_transport.messages import Tagged, Truth, Truths, encode
@@ -23,6 +23,7 @@ FRAME = saw(SECOND, Sighting("oak", 2.0, None), Sighting("elm", None, -0.5))
 SAID: list[tuple[str, Tagged]] = [
     ("in/r1/odometry", standing(SECOND)),
     ("in/r1/sightings", FRAME),
+    ("in/r1/initial_pose", InitialPose(SECOND, 1.0, 2.0, 0.5, (0.01, 0.0, 0.01, 0.0, 0.0, 0.02))),
     ("in/r1/position", Position(SECOND, 1.0, 2.0, (0.01, 0.0, 0.01))),
     ("field/truth", Truths(SECOND, (Truth("r1", 1.0, 2.0, 0.5),))),
 ]
@@ -41,7 +42,7 @@ def test_what_was_said_is_read_again(tmp_path: Path) -> None:
     record(path, *((key, encode(message)) for key, message in SAID))
     recorded = read_recording(path)
     assert recorded.team == TEAM
-    assert recorded.inputs == {"r1": [message for _, message in SAID[:3]]}
+    assert recorded.inputs == {"r1": [message for _, message in SAID[:4]]}
     assert recorded.truth["r1"] == pytest.approx(np.array([[1.0, 1.0, 2.0, 0.5]]))
 
 

@@ -1,5 +1,7 @@
 """What is said of topics that are not heard: one line, with the cause and the remedy."""
 
+from typing import TypeVar
+
 import msgspec
 import pytest
 
@@ -43,8 +45,11 @@ def listening(qos: QosProfile = SENSOR_DATA, messages: int = 1) -> Interest:
     )
 
 
-def changed(endpoint: Endpoint, **fields: object) -> Endpoint:
-    return msgspec.structs.replace(endpoint, **fields)
+Changed = TypeVar("Changed", Endpoint, Interest)
+
+
+def changed(one: Changed, **fields: object) -> Changed:
+    return msgspec.structs.replace(one, **fields)
 
 
 @pytest.mark.parametrize("endpoint", [DRIVER, changed(DRIVER, type_hash=NO_TYPE_HASH)])
@@ -96,6 +101,22 @@ SILENT: list[tuple[str, list[Endpoint], str]] = [
 )
 def test_a_topic_that_is_not_heard_has_one_line(endpoints: list[Endpoint], line: str) -> None:
     assert graph_findings([listening()], endpoints, HERE) == [line]
+
+
+def test_a_second_publisher_of_an_exclusive_topic_is_named() -> None:
+    other = changed(DRIVER, namespace="/", node="amcl")
+    for is_exclusive in (True, False):
+        own = changed(listening(), entity=Entity.PUBLISHER, is_exclusive=is_exclusive)
+        line = "r1/odom: /amcl publishes it too; one of both must stop (is AMCL still running?)"
+        assert graph_findings([own], [other], HERE) == ([line] if is_exclusive else [])
+
+
+def test_nobody_need_publish_an_optional_topic() -> None:
+    own = changed(listening(messages=0), is_optional=True)
+    two = [DRIVER, changed(DRIVER, node="other")]
+    assert graph_findings([own], [NODE], HERE) == graph_findings([own], two, HERE) == []
+    (line,) = graph_findings([own], [changed(DRIVER, type_hash=OTHER_HASH)], HERE)
+    assert "known are" in line
 
 
 def test_a_node_of_its_own_counts_for_nothing() -> None:

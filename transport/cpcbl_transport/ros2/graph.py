@@ -6,6 +6,7 @@ with ROS 2 on Zenoh is silent, because a key with another domain, type or hash i
 
 from collections.abc import Iterable, Iterator, Sequence
 from difflib import SequenceMatcher
+from typing import Any
 
 import msgspec
 
@@ -29,9 +30,13 @@ class Interest(msgspec.Struct, frozen=True, kw_only=True):
     """Those that can be read (subscription), or the one that is written (publisher)."""
     messages: int = 0
     """How many messages arrived under the topic's key, whether or not they could be read."""
+    is_optional: bool = False
+    """Whether any number of nodes may publish it, or none, at any time."""
+    is_exclusive: bool = False
+    """Whether no other node should publish it."""
 
 
-def interest_in(endpoint: Endpoint, hashes: frozenset[str], messages: int = 0) -> Interest:
+def interest_in(endpoint: Endpoint, hashes: frozenset[str], **facts: Any) -> Interest:
     """The interest of an endpoint of this node."""
     assert endpoint.qos is not None, "every topic has a quality of service"
     return Interest(
@@ -40,7 +45,7 @@ def interest_in(endpoint: Endpoint, hashes: frozenset[str], messages: int = 0) -
         type_name=endpoint.type_name,
         qos=endpoint.qos,
         type_hashes=hashes,
-        messages=messages,
+        **facts,
     )
 
 
@@ -113,6 +118,8 @@ def _subscription_findings(
     publishers = [endpoint for endpoint in others if endpoint.entity is Entity.PUBLISHER]
     here = [endpoint for endpoint in publishers if _is_here(endpoint, context)]
     mine = [endpoint for endpoint in here if endpoint.topic == interest.topic]
+    if not mine and interest.is_optional:
+        return
     if not mine:
         yield _unpublished(interest, publishers, here, context)
         return
@@ -124,6 +131,8 @@ def _subscription_findings(
             continue
         readable.append(publisher)
         yield from _qos_problems(interest, publisher, publisher.qos, interest.qos, context)
+    if interest.is_optional:
+        return
     if len(readable) > 1:
         nodes = _some(endpoint.full_node_name for endpoint in readable)
         yield f"{interest.topic}: has {len(readable)} publishers, and all are heard: {nodes}"
@@ -135,7 +144,14 @@ def _publisher_findings(
     interest: Interest, others: Sequence[Endpoint], context: NodeContext
 ) -> Iterator[str]:
     for other in others:
-        if other.entity is not Entity.SUBSCRIPTION or other.topic != interest.topic:
+        if other.topic != interest.topic:
+            continue
+        if other.entity is Entity.PUBLISHER and interest.is_exclusive and _is_here(other, context):
+            yield (
+                f"{interest.topic}: {other.full_node_name} publishes it too; one of both must stop"
+                " (is AMCL still running?)"
+            )
+        if other.entity is not Entity.SUBSCRIPTION:
             continue
         if not _is_here(other, context):
             if other.layout is context.layout:

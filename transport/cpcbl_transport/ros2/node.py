@@ -88,13 +88,22 @@ class RosNode:
         for keys in (tokens.RMW_ZENOH_TOKENS, tokens.ROS2DDS_TOKENS):
             session.watch_liveliness(keys, self._on_token)
 
-    def publisher(self, topic: str, type_name: str, qos: QosProfile = DEFAULT) -> RosPublisher:
-        """Announces a topic that this node publishes. Raises RosNameError."""
+    def publisher(
+        self,
+        topic: str,
+        type_name: str,
+        qos: QosProfile = DEFAULT,
+        is_exclusive: bool = False,
+    ) -> RosPublisher:
+        """Announces a topic that this node publishes; that another one publishes an exclusive one
+        too is a finding. Raises RosNameError."""
         endpoint, key = self._topic(Entity.PUBLISHER, topic, type_name, qos)
         token = tokens.format_token(endpoint)
         declared = self._session.publisher(key, qos)
         handle = self._session.declare_token(token)
-        publisher = RosPublisher(endpoint, gid_of(token), declared, handle, self.types)
+        publisher = RosPublisher(
+            endpoint, gid_of(token), declared, handle, self.types, is_exclusive
+        )
         with self._lock:
             self._publishers.append(publisher)
         return publisher
@@ -106,9 +115,11 @@ class RosNode:
         on_message: ReceivedCallback,
         qos: QosProfile = SENSOR_DATA,
         largest_bytes: int = 0,
+        is_optional: bool = False,
     ) -> Subscription:
         """Subscribes to a topic, whichever distribution its publishers are of. Payloads beyond
-        `largest_bytes` are refused (0: what its type usually needs). Raises RosNameError.
+        `largest_bytes` are refused (0: what its type usually needs). That nobody publishes an
+        optional topic is no finding. Raises RosNameError.
 
         Behind zenoh-bridge-ros2dds it is not announced, so that the bridge takes the quality of
         service of the robot's publisher, which always matches it.
@@ -117,7 +128,7 @@ class RosNode:
         settings, name = self.settings, endpoint.type_name
         keys = topic_key(settings.layout, settings.domain, endpoint.topic, name, "*")
         limit = largest_bytes or largest_payload(name)
-        subscription = Subscription(endpoint, on_message, self.types, limit)
+        subscription = Subscription(endpoint, on_message, self.types, limit, is_optional)
         handles = [self._session.subscribe(keys, qos, subscription.on_sample)]
         if settings.layout is Layout.RMW_ZENOH:
             handles.append(self._session.declare_token(tokens.format_token(endpoint)))

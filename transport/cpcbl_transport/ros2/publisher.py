@@ -22,9 +22,11 @@ class RosPublisher:
         publisher: SamplePublisher,
         token: Handle,
         types: MessageTypes,
+        is_exclusive: bool = False,
     ) -> None:
         self._endpoint, self._gid, self._types = endpoint, gid, types
         self._publisher, self._token = publisher, token
+        self._is_exclusive = is_exclusive
         self._sequence_number, self._lock = 0, threading.Lock()
         self.open = True
 
@@ -65,4 +67,5 @@ class RosPublisher:
 
     def interest(self) -> Interest:
         """What its node wants to know of others."""
-        return interest_in(self._endpoint, frozenset({self._endpoint.type_hash}))
+        own = frozenset({self._endpoint.type_hash})
+        return interest_in(self._endpoint, own, is_exclusive=self._is_exclusive)

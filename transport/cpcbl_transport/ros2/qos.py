@@ -74,6 +74,8 @@ SENSOR_DATA = QosProfile(reliability=Reliability.BEST_EFFORT, depth=5)
 """What a subscription should ask for: publishers of either reliability match it."""
 LATCHED = QosProfile(durability=Durability.TRANSIENT_LOCAL, depth=1)
 """For /tf_static and maps: whoever comes late gets the last message."""
+STATIC_TRANSFORMS = QosProfile(durability=Durability.TRANSIENT_LOCAL, depth=100)
+"""Of a subscription to /tf_static: as tf2 has it."""
 
 _RMW_ZENOH_DEFAULT = QosProfile(depth=DEFAULT_DEPTH)
 

@@ -47,9 +47,10 @@ class Subscription:
         on_message: ReceivedCallback,
         types: MessageTypes,
         largest_bytes: int,
+        is_optional: bool = False,
     ) -> None:
         self._endpoint, self._on_message, self._types = endpoint, on_message, types
-        self._largest_bytes = largest_bytes
+        self._largest_bytes, self._is_optional = largest_bytes, is_optional
         self._lock, self._counts, self._messages = threading.Lock(), Counter[str](), 0
         self._last_numbers: dict[bytes, int] = {}
         self.handles: tuple[Handle, ...] = ()
@@ -134,4 +135,5 @@ class Subscription:
         with self._lock:
             messages = self._messages
         hashes = self._types.readable_hashes(self._endpoint.type_name)
-        return interest_in(self._endpoint, hashes, messages)
+        facts = {"messages": messages, "is_optional": self._is_optional}
+        return interest_in(self._endpoint, hashes, **facts)

@@ -124,6 +124,8 @@ def _odometry_worlds() -> dict[str, World]:
     for count in (0, 1, 2, 4):
         name = "2 s without odometry" + ("" if count == 2 else f", {_landmarks(count)}")
         found[name] = World(_alone(_field(count)), ("r",), silent_s=2.0)
+    turning = _alone(_field(1), waypoints_m=ZIGZAG, speed_m_s=1.0)
+    found["2 s without odometry, fast turns, 1 landmark"] = World(turning, ("r",), silent_s=2.0)
     return found
 
 

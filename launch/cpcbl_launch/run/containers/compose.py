@@ -16,13 +16,14 @@ from cpcbl_launch.run.containers.docker import NAME, checkout, version
 from cpcbl_launch.run.gateway.tokens import tokens_for
 from cpcbl_launch.run.processes import tasks
 from cpcbl_launch.team.file import parse_team
-from cpcbl_team.config import GatewaySettings, Team
+from cpcbl_team.config import GatewaySettings, Ros2Settings, Team
 from cpcbl_team.errors import InputError
 from cpcbl_transport.security import Identity, credentials_in
 from cpcbl_transport.topics import Role
 
 PORT = 7447  # where the router listens, inside
 _SECRET = "gateway-tokens"
+LOCAL = ("localhost", "127.0.0.1", "[::1]")
 
 
 class Mount(NamedTuple):
@@ -129,11 +130,31 @@ def _from(folder: Path, path: Path) -> str:
 
 def extras_of(team: Team) -> str:
     """The extras of this program that the containers of a team need."""
-    return "camera" if team.cameras else ""
+    if team.ros2 is None:
+        return "camera" if team.cameras else ""
+    from cpcbl_launch.run.ros2.command import needs_opencv  # no other team needs it
+
+    detects = team.cameras or any(needs_opencv(team, name) for name in team.robots)
+    return "camera ros2" if detects else "ros2"
+
+
+def require_ros2_in_containers(ros2: Ros2Settings | None) -> None:
+    """Raises InputError where a bridge in a container could not reach the router of ROS 2."""
+    if ros2 is None:
+        return
+    beside = "or remove [ros2] here, and run `cpcbl-team bridge ros2` beside the containers"
+    if ros2.keys:
+        raise InputError(f"ros2.keys: a bridge in a container does not have them; {beside}")
+    for endpoint in ros2.connect:
+        if endpoint.partition("/")[2].rpartition(":")[0] in LOCAL:
+            own = "in a container that is the container itself; write this machine's address"
+            raise InputError(f"ros2.connect: {endpoint!r}: {own}, {beside}")
 
 
 def compose_text(team: Team, how: Deployment) -> str:
-    """The whole compose file: the router, the field if anything is simulated, a service a robot."""
+    """The whole compose file: the router, the field if anything is simulated, a service a robot,
+    the bridge to ROS 2. Raises InputError for a bridge that could not work there."""
+    require_ros2_in_containers(team.ros2)
     here = team.robots if how.here is None else how.here
     field = " the simulated field," if team.simulated else ""
     robots = "one robot" if len(here) == 1 else f"{len(here)} robots"

@@ -5,13 +5,18 @@ import logging
 import time
 from typing import NamedTuple
 
-from cpcbl_team.inputs import Odometry, Position, Sightings
+from cpcbl_team.inputs import InitialPose, Odometry, Sightings
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus, Publisher
 from cpcbl_transport.decoding import decode_by_key, input_problem
 from cpcbl_transport.json_messages import is_json
-from cpcbl_transport.messages import Frame, Refusal, refusal
-from cpcbl_transport.units import odometry_problem, sighting_problem, stamp_problem
+from cpcbl_transport.messages import Refusal, SensorInput, refusal
+from cpcbl_transport.units import (
+    initial_pose_problem,
+    odometry_problem,
+    sighting_problem,
+    stamp_problem,
+)
 
 log = logging.getLogger(__name__)
 
@@ -111,7 +116,7 @@ class RobotInputs:
         message = decode_by_key(key, payload)
         if isinstance(message, Refusal):
             return Problem(400, message.value, input_problem(key, payload))
-        assert isinstance(message, Odometry | Sightings | Position | Frame)
+        assert isinstance(message, SensorInput)
         found = _message_problem(message, now_ns)
         late_s = (now_ns - message.stamp_ns) * 1e-9
         if found is None and late_s > LATE_S:
@@ -120,9 +125,7 @@ class RobotInputs:
         return found
 
 
-def _message_problem(
-    message: Odometry | Sightings | Position | Frame, now_ns: int
-) -> Problem | None:
+def _message_problem(message: SensorInput, now_ns: int) -> Problem | None:
     """Why the robot refuses a message, or would take it in a wrong unit."""
     reason, unit = refusal(message, now_ns), stamp_problem(message.stamp_ns, now_ns)
     if reason is not None or unit:  # the robot refuses it as too late, if for no other reason
@@ -136,4 +139,6 @@ def _message_problem(
         unit = odometry_problem(message.distance_m, message.turn_rad, duration_s)
     elif isinstance(message, Sightings):
         unit = next(filter(None, map(sighting_problem, message.sightings)), "")
+    elif isinstance(message, InitialPose):
+        unit = initial_pose_problem(message)
     return Problem(400, "wrong_unit", unit) if unit else None

@@ -58,7 +58,9 @@ class RobotBridge:
             self.inputs = RobotInputs(name, team, bus, stamps, now_ns, refusals)
         self._outputs = RobotOutputs(name, team, node, self.inputs)
         for row in self.inputs.topics() if self.inputs is not None else ():
-            node.subscribe(row.topic, row.type_name, partial(self._on_message, row))
+            on_message = partial(self._on_message, row)
+            qos, optional = row.qos, row.is_optional
+            node.subscribe(row.topic, row.type_name, on_message, qos, is_optional=optional)
         Subscriber(bus, Pose, self._on_pose, robot=name)
         Subscriber(bus, Status, self._on_status, robot=name)
 

@@ -14,6 +14,9 @@ from cpcbl_team.config import CameraSettings
 PINHOLE = ("plumb_bob", "rational_polynomial", "")
 FISHEYE = ("equidistant", "fisheye")
 LEAST_FOCAL, MOST_FOCAL = 0.1, 50.0  # of the width of an image
+FARTHEST_CENTRE = 10.0  # of the width
+MOST_LENS = 1e3  # of a coefficient of distortion
+LEAST_PX = 16
 
 
 class RosCamera:
@@ -60,11 +63,16 @@ def camera_of_info(info: Any, mounted: CameraSettings, rectified: bool) -> RosCa
     if model not in FISHEYE and lens.size not in (0, 4, 5, 8, 12, 14):
         return _unusable(f"has {lens.size} coefficients; there must be 4, 5, 8, 12 or 14")
     width, height = int(info.width), int(info.height)
-    if not (16 <= width <= 8192 and 16 <= height <= 8192):
+    if not (LEAST_PX <= width <= 8192 and LEAST_PX <= height <= 8192):
         return _unusable(f"is of {width} x {height} pixels")
-    if not LEAST_FOCAL < matrix[0, 0] / width < MOST_FOCAL:
-        return _unusable(f"has a focal length of {matrix[0, 0]:g} pixels, {width} pixels wide")
+    for focal in (matrix[0, 0], matrix[1, 1]):
+        if not LEAST_FOCAL < focal / width < MOST_FOCAL:
+            return _unusable(f"has a focal length of {focal:g} pixels, {width} pixels wide")
+    if np.abs(matrix[:2, 2]).max() > FARTHEST_CENTRE * width or (np.abs(lens) > MOST_LENS).any():
+        return _unusable("has a centre or a distortion that no lens has")
     matrix, width, height = _of_region(info, matrix.copy(), width, height)
+    if min(width, height) < LEAST_PX:
+        return _unusable(f"is of {width} x {height} pixels, with its region and its binning")
     settings = replace(mounted, width_px=width, height_px=height)
     return RosCamera(settings, matrix, lens, model)
 

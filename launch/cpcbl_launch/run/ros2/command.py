@@ -2,8 +2,9 @@
 
 import logging
 import time
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from pathlib import Path
+from typing import Any
 
 from cpcbl_agents.clock import Clock
 from cpcbl_launch.run.gateway.command import RouterWatch
@@ -11,8 +12,10 @@ from cpcbl_launch.run.processes import bridge_identity
 from cpcbl_launch.run.ros2.bridge import TeamBridge
 from cpcbl_launch.run.ros2.robot_inputs import has_tags
 from cpcbl_launch.team.requirements import require_opencv
-from cpcbl_team.config import Ros2Settings, Team
+from cpcbl_launch.team.ros2_checks import INPUTS, OUTPUTS, SHARED
+from cpcbl_team.config import Ros2RobotSettings, Ros2Settings, Team
 from cpcbl_team.errors import InputError
+from cpcbl_transport.ros2.access import BridgeTopics, access_control_of_bridge
 from cpcbl_transport.ros2.names import Distribution, Layout
 from cpcbl_transport.ros2.node import NodeSettings, open_node
 from cpcbl_transport.security import (
@@ -95,6 +98,28 @@ def node_settings(
         layout=Layout(ros2.layout),
         credentials=_credentials(ros2.keys),
     )
+
+
+def router_access(team: Team, bridge: Sequence[str], nodes: Sequence[str]) -> dict[str, Any]:
+    """The access control of the router of ROS 2, for these common names of certificates."""
+    ros2 = with_ros2(team).ros2
+    assert ros2 is not None
+    read, own, shared = list[str](), list[str](), [ros2.diagnostics, ros2.markers]
+    for name, robot in team.robots.items():
+        own += _topics(ros2, name, robot.ros2, OUTPUTS)
+        shared += _topics(ros2, name, robot.ros2, SHARED if robot.ros2.map_frame else ("tf",))
+        if robot.source == "external":
+            read += _topics(ros2, name, robot.ros2, (*INPUTS, "tf_static"))
+    written = [topic.lstrip("/") for topic in (*own, *shared) if topic]
+    topics = BridgeTopics(*(tuple(dict.fromkeys(part)) for part in (read, written, own)))
+    return access_control_of_bridge(topics, Layout(ros2.layout), ros2.domain, bridge, nodes)
+
+
+def _topics(
+    ros2: Ros2Settings, robot: str, settings: Ros2RobotSettings, keys: Iterable[str]
+) -> list[str]:
+    """The topics of a robot that these keys name."""
+    return [ros2.topic(robot, topic) for key in keys if (topic := getattr(settings, key))]
 
 
 def _credentials(keys: str) -> Credentials | None:

@@ -3,11 +3,15 @@
 import math
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from cpcbl_launch.run.ros2.refused import BadMessage, Refused, is_finite
 from cpcbl_team.geometry import Pose2
 
 LEAST_NORM, MOST_NORM = 0.9, 1.1  # of a quaternion that is a rotation
 S_NS = 1_000_000_000
+Floats = NDArray[np.float64]
 Fields = dict[str, Any]
 """A message that goes out: the fields that differ from their defaults."""
 
@@ -30,13 +34,37 @@ def header_fields(stamp_ns: int, frame: str) -> Fields:
 
 def yaw_of(quaternion: Any) -> float | Refused:
     """The heading (rad) of a rotation: where its x axis points, seen from above."""
+    numbers = _rotation_numbers(quaternion)
+    if isinstance(numbers, Refused):
+        return numbers
+    x, y, z, w = numbers
+    return math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+
+
+def rotation_of(quaternion: Any) -> Floats | Refused:
+    """The matrix (3, 3) of a rotation."""
+    numbers = _rotation_numbers(quaternion)
+    if isinstance(numbers, Refused):
+        return numbers
+    x, y, z, w = np.array(numbers) / math.hypot(*numbers)
+    return np.array(
+        [
+            [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
+            [2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)],
+            [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)],
+        ]
+    )
+
+
+def _rotation_numbers(quaternion: Any) -> tuple[float, float, float, float] | Refused:
+    """x, y, z and w of a quaternion that is a rotation."""
     x, y, z, w = (float(getattr(quaternion, name)) for name in "xyzw")
     if not is_finite((x, y, z, w)):
         return Refused(BadMessage.NOT_FINITE, "the orientation is not finite")
     if not LEAST_NORM <= (norm := math.sqrt(x * x + y * y + z * z + w * w)) <= MOST_NORM:
         text = f"the orientation is no rotation: its quaternion has the length {norm:.3g}, not 1"
         return Refused(BadMessage.ZERO_QUATERNION, text)
-    return math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+    return x, y, z, w
 
 
 def planar_pose(pose: Any) -> Pose2 | Refused:

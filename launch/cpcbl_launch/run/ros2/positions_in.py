@@ -1,16 +1,19 @@
 """NavSatFix and PoseWithCovarianceStamped as positions in the field's frame."""
 
 import math
+from collections.abc import Collection
 from typing import Any
 
 from cpcbl_launch.run.ros2.planar import planar_pose
 from cpcbl_launch.run.ros2.refused import BadMessage, Refused, is_finite
 from cpcbl_team.config import Datum
-from cpcbl_team.inputs import Position
+from cpcbl_team.initial_pose import is_covariance
+from cpcbl_team.inputs import InitialPose, Position
 
 EQUATOR_M, FLATTENING = 6_378_137.0, 1.0 / 298.257223563  # WGS 84
 FARTHEST_M = 50_000.0  # beyond, the plane is not the earth
 
+RVIZ_COVARIANCE = 0.25, 0.0, 0.25, 0.0, 0.0, math.radians(15.0) ** 2
 Covariance = tuple[float, float, float]
 
 
@@ -30,6 +33,26 @@ def position_of_pose(
     if isinstance(covariance, Refused):
         return covariance
     return Position(stamp_ns, pose.x, pose.y, covariance)
+
+
+def initial_pose_of(message: Any, stamp_ns: int, frames: Collection[str]) -> InitialPose | Refused:
+    """A geometry_msgs/PoseWithCovarianceStamped in one of the field's frames as a pose that
+    somebody sets. A covariance of zeros, which programs send that have none, is that of RViz."""
+    if (frame := message.header.frame_id.strip("/")) not in frames:
+        text = f"frame {min(frames)!r} expected, {frame!r} came; set the fixed frame of RViz"
+        return Refused(BadMessage.WRONG_FRAME, text)
+    pose = planar_pose(message.pose.pose)
+    if isinstance(pose, Refused):
+        return pose
+    c = [float(n) for n in message.pose.covariance]
+    if not is_finite(c):
+        return Refused(BadMessage.NOT_FINITE, "the covariance is not finite")
+    xy, xh, yh = (0.5 * (c[i] + c[j]) for i, j in ((1, 6), (5, 30), (11, 31)))
+    covariance = (c[0], xy, c[7], xh, yh, c[35]) if any(c) else RVIZ_COVARIANCE
+    if not is_covariance(covariance):
+        numbers = ", ".join(f"{n:g}" for n in covariance)
+        return Refused(BadMessage.NOT_A_COVARIANCE, f"{numbers} is no covariance of x, y, heading")
+    return InitialPose(stamp_ns, *pose, covariance)
 
 
 def position_of_fix(

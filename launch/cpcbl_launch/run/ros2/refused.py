@@ -23,6 +23,7 @@ class BadMessage(StrEnum):
     NOT_A_COVARIANCE = "not_a_covariance"
     WRONG_FRAME = "wrong_frame"
     FRAME_LOOP = "frame_loop"
+    TWO_PARENTS = "two_parents"
     WRONG_CLOCK = "wrong_clock"
     CLOCK_BACK = "clock_back"
     OUT_OF_ORDER = "out_of_order"

@@ -13,11 +13,13 @@ from cpcbl_launch.run.ros2.odometry_in import OdometryInput
 from cpcbl_launch.run.ros2.planar import stamp_of
 from cpcbl_launch.run.ros2.refused import BadMessage, RefusalLog, Refused
 from cpcbl_launch.run.ros2.stamps import StampMap
-from cpcbl_team.config import Team
-from cpcbl_team.inputs import Odometry, Position, Sightings
+from cpcbl_launch.run.ros2.transforms_in import CameraMounting, MovingFrames
+from cpcbl_team.config import CameraSettings, Team
+from cpcbl_team.inputs import InitialPose, Odometry, Position, Sightings
 from cpcbl_transport.bus import Bus, Publisher
 from cpcbl_transport.messages import Frame, SensorInput, encode, refusal
 from cpcbl_transport.ros2 import messages as types
+from cpcbl_transport.ros2.qos import SENSOR_DATA, STATIC_TRANSFORMS, QosProfile
 from cpcbl_transport.topics import topic_of
 
 if TYPE_CHECKING:  # it needs OpenCV
@@ -38,6 +40,12 @@ class InputTopic(NamedTuple):
     topic: str
     type_name: str
     take: Take
+    is_optional: bool = False  # it may be silent
+
+    @property
+    def qos(self) -> QosProfile:
+        """What its subscription asks for."""
+        return STATIC_TRANSFORMS if self.type_name == types.TRANSFORMS else SENSOR_DATA
 
 
 class RobotInputs:
@@ -62,13 +70,18 @@ class RobotInputs:
         """Of the odometry and the stamps."""
         self._tag_lock = threading.Lock()
         topic = team.ros2.topic(name, settings.ros2.odometry)
-        field_frame = team.ros2.field_frame
+        self.map_frame = settings.ros2.map_frame or team.ros2.field_frame
+        """What the tree of this robot calls the field's frame."""
         note = partial(refusals.add, topic)
-        self.odometry = OdometryInput(settings.ros2, field_frame, note)
+        self.odometry = OdometryInput(settings.ros2, self.map_frame, note)
         self._tags: TagInput | None = None
         self._names = frozenset(team.map.landmarks) | frozenset(team.map.walls)
         self._names |= frozenset(team.robots) - {name}
+        note = partial(refusals.add, team.ros2.topic(name, settings.ros2.tf_static))
+        self._mounting = CameraMounting(name, settings.camera, note)
         self._publishers: dict[type[SensorInput], Publisher] = {}
+        if settings.ros2.initial_pose:  # one comes, and it must not be before its publisher
+            self._publisher(InitialPose)
         self.counts: dict[str, int] = {}
         """Messages by topic."""
         self._arrived_s: dict[str, float] = {}
@@ -86,6 +99,8 @@ class RobotInputs:
             InputTopic(keys.ranges, types.RANGE, self._take_range),
             InputTopic(keys.detections_3d, types.DETECTIONS, self._take_detections_3d),
             InputTopic(keys.position, types.POSE, self._take_position),
+            InputTopic(keys.initial_pose, types.POSE, self._take_initial_pose, True),
+            InputTopic(keys.tf_static, types.TRANSFORMS, self._take_transforms, True),
         ]
         if self._ros2.datum is not None:
             rows.append(InputTopic(keys.navsat, types.NAV_SAT_FIX, self._take_fix))
@@ -127,7 +142,13 @@ class RobotInputs:
             self._put(taken)
 
     def _input_of(self, row: InputTopic, message: Any) -> Taken:
-        ros_ns, now_ns = stamp_of(message.header), self._now_ns()
+        now_ns = self._now_ns()
+        if row.type_name == types.TRANSFORMS:
+            return row.take(message, now_ns, 0)
+        ros_ns = stamp_of(message.header)
+        if row.is_optional and (self._ros2.sim_time or ros_ns == 0):
+            # A person means now; a clock of RViz must not move that of the simulation
+            return row.take(message, now_ns, ros_ns)
         with self.lock:
             team_ns = self._stamps.team_ns(ros_ns, now_ns)
             if isinstance(team_ns, Refused):
@@ -138,14 +159,16 @@ class RobotInputs:
 
     def _put(self, message: SensorInput) -> None:
         """Publishes an input. What the robot would refuse is passed on, so that it counts it."""
-        kind = type(message)
-        if kind not in self._publishers:
-            topic = topic_of(kind)
-            self._publishers[kind] = self._bus.publisher(topic.at(robot=self._name), topic.qos)
         if reason := refusal(message, self._now_ns()):
             text = f"the robot refuses it: {reason.replace('_', ' ')}"
             self._refusals.add(f"in/{self._name}", Refused(BadMessage.UNSUPPORTED, text))
-        self._publishers[kind].put(encode(message))
+        self._publisher(type(message)).put(encode(message))
+
+    def _publisher(self, kind: type[SensorInput]) -> Publisher:
+        if kind not in self._publishers:
+            topic = topic_of(kind)
+            self._publishers[kind] = self._bus.publisher(topic.at(robot=self._name), topic.qos)
+        return self._publishers[kind]
 
     # One function for each type -----------------------------------------------------------------
 
@@ -166,7 +189,7 @@ class RobotInputs:
 
             topic = self._ros2.topic(self._name, self._settings.ros2.detections)
             note = partial(self._refusals.add, topic)
-            self._tags = TagInput(self._name, self._team, note)
+            self._tags = TagInput(self._name, self._team, note, self._mounted)
         return self._tags
 
     def _take_detections_3d(
@@ -175,8 +198,28 @@ class RobotInputs:
         topic = self._ros2.topic(self._name, self._settings.ros2.detections_3d)
         note = partial(self._refusals.add, topic)
         names, settings = self._names, self._settings
-        found = sensors_in.sightings_of_detections(message, team_ns, settings, names, note)
+        frame, base_frame = str(message.header.frame_id).strip("/"), self.odometry.base_frame
+        if "optical" in frame:
+            self._mounting.camera(frame, base_frame)  # only to compare
+        base_from_frame = self._mounting.base_from(frame, base_frame)
+        found = sensors_in.sightings_of_detections(
+            message, team_ns, settings, names, note, base_from_frame
+        )
         return _if_any(found)
+
+    def _take_transforms(self, message: Any, team_ns: int, ros_ns: int) -> None:
+        with self.lock:
+            frame = self.odometry.frame or self._settings.ros2.odometry_frame
+            moving = MovingFrames(self.map_frame, frame, self.odometry.base_frame)
+        self._mounting.take(message, moving)
+
+    def _mounted(self, frame: str) -> CameraSettings:
+        """The camera whose messages are of this frame."""
+        return self._mounting.camera(frame, self.odometry.base_frame)
+
+    def _take_initial_pose(self, message: Any, team_ns: int, ros_ns: int) -> InitialPose | Refused:
+        frames = {frame.strip("/") for frame in (self._ros2.field_frame, self.map_frame)}
+        return positions_in.initial_pose_of(message, team_ns, frames)
 
     def _take_range(self, message: Any, team_ns: int, ros_ns: int) -> Sightings | Refused:
         return sensors_in.sightings_of_range(message, team_ns, self._names)
@@ -195,10 +238,12 @@ class RobotInputs:
         return None if own is None else own.sigma_m
 
     def _take_jpeg(self, message: Any, team_ns: int, ros_ns: int) -> Frame | Refused | None:
+        self._mounted(str(message.header.frame_id))
         too_soon = self._is_too_soon(team_ns)
         return None if too_soon else sensors_in.frame_of_compressed(message, team_ns)
 
     def _take_image(self, message: Any, team_ns: int, ros_ns: int) -> Frame | Refused | None:
+        self._mounted(str(message.header.frame_id))  # only to compare: the robot has the team file
         return None if self._is_too_soon(team_ns) else sensors_in.frame_of_image(message, team_ns)
 
     def _is_too_soon(self, team_ns: int) -> bool:
@@ -216,8 +261,9 @@ class RobotInputs:
         if now_s - self._begun_s > SILENT_S:
             for row in self.topics():
                 arrived_s = self._arrived_s.get(row.topic)
-                if arrived_s is not None and now_s - arrived_s > SILENT_S:
+                if arrived_s is not None and not row.is_optional and now_s - arrived_s > SILENT_S:
                     found.append(f"{row.topic}: nothing for {now_s - arrived_s:.0f} s")
+        found += self._mounting.findings
         if any(not publisher.matching for publisher in self._publishers.values()):
             text = "does `cpcbl-team robot` run for it, with the same team name and router?"
             found.append(f"no robot {self._name} takes inputs: {text}")

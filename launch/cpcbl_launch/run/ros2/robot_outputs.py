@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 from cpcbl_launch.run.ros2.building import build_message
 from cpcbl_launch.run.ros2.odometry_in import TrackPoint
-from cpcbl_launch.run.ros2.planar import Fields
+from cpcbl_launch.run.ros2.planar import Fields, transform_fields
 from cpcbl_launch.run.ros2.poses_out import (
     odometry_message,
     odometry_transform_message,
@@ -13,9 +13,11 @@ from cpcbl_launch.run.ros2.poses_out import (
 )
 from cpcbl_launch.run.ros2.robot_inputs import RobotInputs
 from cpcbl_team.config import Team
+from cpcbl_team.geometry import Pose2
 from cpcbl_transport.messages import Pose
 from cpcbl_transport.ros2 import messages as types
 from cpcbl_transport.ros2.node import RosNode
+from cpcbl_transport.ros2.qos import DEFAULT, LATCHED, QosProfile
 
 TRANSFORM_NS = 20_000_000  # between two transforms odometry -> robot
 
@@ -23,9 +25,16 @@ TRANSFORM_NS = 20_000_000  # between two transforms odometry -> robot
 class Output:
     """One topic of ROS 2 that takes dictionaries."""
 
-    def __init__(self, node: RosNode, topic: str, type_name: str) -> None:
+    def __init__(
+        self,
+        node: RosNode,
+        topic: str,
+        type_name: str,
+        qos: QosProfile = DEFAULT,
+        is_exclusive: bool = False,
+    ) -> None:
         self._types, self._type_name = node.types, type_name
-        self._publisher = node.publisher(topic, type_name)
+        self._publisher = node.publisher(topic, type_name, qos, is_exclusive)
 
     def put(self, fields: Fields) -> None:
         """Publishes a message with these fields."""
@@ -44,16 +53,24 @@ class RobotOutputs:
         self._keys = keys = settings.ros2
         self._delay_ns = int(settings.odometry.delay_s * 1e9)
 
-        def output(topic: str, type_name: str) -> Callable[[Fields], None]:
+        def output(
+            topic: str, type_name: str, qos: QosProfile = DEFAULT
+        ) -> Callable[[Fields], None]:
             if not topic:
                 return lambda fields: None
-            return Output(node, ros2.topic(name, topic), type_name).put
+            is_pose = type_name != types.TRANSFORMS
+            return Output(node, ros2.topic(name, topic), type_name, qos, is_pose).put
 
         has_odometry = inputs is not None and settings.odometry.moves
         self._pose = output(keys.pose, types.POSE)
         self._odometry = output(keys.pose_odometry, types.ODOMETRY)
         self._transforms = output(keys.tf if has_odometry else "", types.TRANSFORMS)
         self._transform_ns = 0
+        self._map_frame = keys.map_frame or ros2.field_frame
+        if self._map_frame != ros2.field_frame:
+            of_map = output(keys.tf_static, types.TRANSFORMS, LATCHED)
+            here = transform_fields(Pose2(0.0, 0.0, 0.0), ros2.field_frame, self._map_frame, 0)
+            of_map({"transforms": [here]})
 
     def on_pose(self, pose: Pose) -> None:
         """Publishes a pose, and the transform that belongs to it."""
@@ -63,7 +80,7 @@ class RobotOutputs:
         if at is None and self._ros2.sim_time:
             return  # its time in the simulation is not known
         ros_ns = pose.stamp_ns - self._delay_ns if at is None else at.ros_ns
-        field_frame = self._ros2.field_frame
+        field_frame = self._map_frame
         self._pose(pose_message(pose, ros_ns, field_frame))
         if self._keys.pose_odometry:
             base_frame = frames[1] or "base_link"

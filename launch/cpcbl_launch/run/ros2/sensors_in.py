@@ -6,6 +6,7 @@ from typing import Any
 
 import msgspec
 
+from cpcbl_launch.run.ros2.planar import Floats
 from cpcbl_launch.run.ros2.refused import BadMessage, Refused, is_finite
 from cpcbl_team.config import CameraSettings, RobotSettings
 from cpcbl_team.errors import nearest_name
@@ -20,14 +21,25 @@ Note = Callable[[Refused], None]
 
 
 def sightings_of_detections(
-    message: Any, stamp_ns: int, settings: RobotSettings, names: Collection[str], note: Note
+    message: Any,
+    stamp_ns: int,
+    settings: RobotSettings,
+    names: Collection[str],
+    note: Note,
+    base_from_frame: Floats | None = None,
 ) -> Sightings | Refused:
     """A vision_msgs/Detection3DArray: the class of each detection names a landmark or a robot, and
-    its position is in the robot's frame, or in the optical frame of the robot's camera."""
+    its position is in the robot's frame, or in the optical frame of the robot's camera. Of any
+    other frame `base_from_frame` (4, 4) says where it is on the robot, if that is known."""
     frame = str(message.header.frame_id)
     kind = settings.ros2.detections_3d_frame
     is_optical = kind == "camera" or (kind == "by_name" and "optical" in frame)
-    if not is_optical and kind == "by_name" and not _is_base(frame, settings.ros2.base_frame):
+    is_placed = kind == "by_name" and base_from_frame is not None
+    if (
+        not (is_optical or is_placed)
+        and kind == "by_name"
+        and not _is_base(frame, settings.ros2.base_frame)
+    ):
         text = f"frame {frame!r} is neither the robot's nor an optical one; set detections_3d_frame"
         return Refused(BadMessage.WRONG_FRAME, text)
     if len(message.detections) > MOST_DETECTIONS:
@@ -35,6 +47,10 @@ def sightings_of_detections(
         return Refused(BadMessage.BAD_DETECTION, text)
     robot_from_frame = _rotation(settings.camera) if is_optical else _UNTURNED
     offset = (settings.camera.x_m, settings.camera.y_m) if is_optical else (0.0, 0.0)
+    if is_placed and base_from_frame is not None:
+        ahead, left = base_from_frame[:2].tolist()
+        robot_from_frame = (tuple(ahead[:3]), tuple(left[:3]))
+        offset = ahead[3], left[3]
     found = []
     for detection in message.detections:
         seen = _sighting(detection, robot_from_frame, offset, names)

@@ -26,11 +26,12 @@ from cpcbl_agents.vision.markers import (
 from cpcbl_agents.vision.poses import Lean, PoseFit, fit_pose
 from cpcbl_launch.run.ros2.camera_info import RosCamera, camera_of_info, is_rotated
 from cpcbl_launch.run.ros2.refused import BadMessage, Refused, is_finite
-from cpcbl_team.config import Side, Team, VisionSettings
+from cpcbl_team.config import CameraSettings, Side, Team, VisionSettings
 from cpcbl_team.inputs import Sighting, Sightings
 
 LEAST_SIDE_PX = 4.0
 OUTSIDE = 0.05  # of the size of an image: corners beyond are of another size of image
+LEAST_SINE = 0.02  # of the angle at a corner
 MOST_TAGS = 100  # in one message
 
 
@@ -38,12 +39,18 @@ class TagInput:
     """The tags that one robot detects."""
 
     def __init__(
-        self, robot: str, team: Team, note: Callable[[Refused], None] = lambda refused: None
+        self,
+        robot: str,
+        team: Team,
+        note: Callable[[Refused], None] = lambda refused: None,
+        mounted: Callable[[str], CameraSettings] | None = None,
     ) -> None:
-        """`note` is told of tags that are left out."""
+        """`note` is told of tags that are left out. `mounted`: the camera whose messages are of a
+        frame; None: that of the team file."""
         self._robot, self._team, self._note = robot, team, note
         settings = team.robots[robot]
-        self._mounted, self._rectified = settings.camera, settings.ros2.rectified
+        self._rectified = settings.ros2.rectified
+        self._mounted = mounted or (lambda frame: settings.camera)
         self._mounts: dict[int, list[MarkerMount]] = defaultdict(list)
         for name, other in team.robots.items():
             for side, number in other.markers.items():
@@ -57,7 +64,7 @@ class TagInput:
                 marker_mounted_m=tag.mounted_m or team.vision.marker_mounted_m,
                 marker_distance_m=0.0,
             )
-        leans = (self._mounted.tilt_sigma_deg, self._mounted.roll_sigma_deg)
+        leans = (settings.camera.tilt_sigma_deg, settings.camera.roll_sigma_deg)
         self._fits = MarkerFits(Lean(*map(math.radians, leans)))
         self._camera: RosCamera | None = None
         self._info: tuple[Any, ...] = ()
@@ -70,10 +77,12 @@ class TagInput:
 
     def take_camera_info(self, info: Any) -> Refused | None:
         """The camera as it is from now on."""
-        same = (*info.k, *info.d, *info.p, int(info.width), int(info.height), int(info.binning_x))
+        mounted = self._mounted(str(info.header.frame_id))
+        size = int(info.width), int(info.height), int(info.binning_x)
+        same = (*info.k, *info.d, *info.p, *size, mounted)
         if same == self._info and self._camera is not None:
             return None
-        found = camera_of_info(info, self._mounted, self._rectified)
+        found = camera_of_info(info, mounted, self._rectified)
         if isinstance(found, Refused):
             return found
         if self._rectified and is_rotated(info.r):
@@ -149,17 +158,28 @@ class TagInput:
         outline = np.array([[float(p.x), float(p.y)] for p in detection.corners])
         if not is_finite(outline.flat):
             return Refused(BadMessage.NOT_FINITE, "a corner is not finite")
-        sides_px = np.linalg.norm(np.roll(outline, -1, axis=0) - outline, axis=1)
-        if sides_px.min() < LEAST_SIDE_PX:
-            text = f"tag {int(detection.id)} has a side of {sides_px.min():.1f} pixels"
-            return Refused(BadMessage.BAD_DETECTION, text)
         size = np.array(camera.size_px)
         if (outline < -OUTSIDE * size).any() or (outline > (1.0 + OUTSIDE) * size).any():
             text = f"corners are outside of the {size[0]} x {size[1]} pixels of camera_info"
             return Refused(BadMessage.WRONG_SIZE, text)
-        order = _upright_order(camera.on_plane(outline), camera.camera)
-        plane = camera.on_plane(outline)[order]
-        return DetectedMarker(int(detection.id), outline[order], plane)
+        sides_px = np.linalg.norm(np.roll(outline, -1, axis=0) - outline, axis=1)
+        if sides_px.min() < LEAST_SIDE_PX:
+            text = f"tag {int(detection.id)} has a side of {sides_px.min():.1f} pixels"
+            return Refused(BadMessage.BAD_DETECTION, text)
+        plane = camera.on_plane(outline)
+        if not is_finite(plane.flat) or not _is_convex(plane):
+            text = f"the corners of tag {int(detection.id)} are those of no square"
+            return Refused(BadMessage.BAD_DETECTION, text)
+        order = _upright_order(plane, camera.camera)
+        return DetectedMarker(int(detection.id), outline[order], plane[order])
+
+
+def _is_convex(plane: Floats) -> bool:
+    """Whether the sides of a quadrilateral (4, 2) all turn the same way."""
+    sides = np.roll(plane, -1, axis=0) - plane
+    x, y = (sides / np.linalg.norm(sides, axis=1, keepdims=True)).T
+    sines = x * np.roll(y, -1) - y * np.roll(x, -1)
+    return bool(abs(np.sign(sines).sum()) == 4 and np.abs(sines).min() > LEAST_SINE)
 
 
 def _upright_order(plane: Floats, camera: Camera) -> list[int]:
@@ -174,5 +194,6 @@ def _upright_order(plane: Floats, camera: Camera) -> list[int]:
 
 def _misfit(fit: PoseFit) -> str:
     """Why a pose is not used; empty if it is."""
-    is_bad = fit.corner_variance > MOST_MISFIT or max(map(abs, fit.lean)) > MOST_LEAN_RAD
-    return "bad_fit" if is_bad else ""
+    is_good = fit.corner_variance <= MOST_MISFIT and max(map(abs, fit.lean)) <= MOST_LEAN_RAD
+    is_good = is_good and is_finite(fit.covariance.flat)
+    return "" if is_good and np.linalg.eigvalsh(fit.covariance)[0] > 0.0 else "bad_fit"

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import pytest
 from support.processes import eventually
-from support.ros2 import MS, camera_info, lab, odometry, pose_stamped
+from support.ros2 import MS, OPTICAL, camera_info, lab, message, odometry, pose_stamped, static
 from support.routers import open_router
 
 from cpcbl_launch.run.ros2.bridge import TeamBridge
@@ -16,7 +16,7 @@ from cpcbl_launch.run.ros2.command import node_settings
 from cpcbl_launch.run.up import free_endpoint
 from cpcbl_team.config import Team
 from cpcbl_team.geometry import Pose2
-from cpcbl_team.inputs import Odometry, Position
+from cpcbl_team.inputs import InitialPose, Odometry, Position
 from cpcbl_transport import topics
 from cpcbl_transport.decoding import decode_by_key
 from cpcbl_transport.messages import Pose, encode
@@ -24,6 +24,7 @@ from cpcbl_transport.ros2 import messages as types
 from cpcbl_transport.ros2.names import topic_key
 from cpcbl_transport.ros2.node import NodeSettings, RosNode, open_node
 from cpcbl_transport.ros2.publisher import RosPublisher
+from cpcbl_transport.ros2.qos import LATCHED, STATIC_TRANSFORMS
 from cpcbl_transport.ros2.subscription import Received
 from cpcbl_transport.zenoh_bus import ZenohBus, open_bus
 
@@ -64,12 +65,13 @@ def until_it(act: Callable[[], None], has_worked: Callable[[], bool]) -> None:
 def stand(team: Team, now_ns: Callable[[], int] = time.time_ns) -> Iterator[Stand]:
     endpoint = free_endpoint()
     assert team.ros2 is not None
-    settings = NodeSettings(connect=(endpoint,), name="robots")
+    ours = node_settings(team.ros2, [endpoint])
+    settings = NodeSettings(connect=(endpoint,), name="robots", layout=ours.layout)
     with (
         open_router(team.name, [endpoint]),
         open_bus(team.name, [endpoint]) as own,
         open_bus(team.name, [endpoint]) as bus,
-        open_node(node_settings(team.ros2, [endpoint])) as node,
+        open_node(ours) as node,
         open_node(settings) as robots,
     ):
         inputs: list[Any] = []
@@ -189,6 +191,65 @@ def test_simulated_time_comes_back_as_it_went_in() -> None:
         until_it(lambda: robot.put(pose), lambda: "r1/amcl_pose" in own.heard)
         stamp = own.heard["r1/amcl_pose"][0].header.stamp
         assert (stamp.sec, stamp.nanosec) == (12, 900_000_000)
+
+
+SIMULATED = (("[ros2]", "[ros2]\nsim_time = true"),)
+BEHIND_DDS = (("[ros2]", '[ros2]\nlayout = "ros2dds"'),)
+
+
+@pytest.mark.parametrize("changes", [(), SIMULATED, BEHIND_DDS])
+def test_the_button_of_rviz_sets_the_pose(changes: tuple[tuple[str, str], ...]) -> None:
+    with stand(lab(*changes)) as own:
+        rviz = own.robots.publisher("r1/initialpose", types.POSE)
+        assert eventually(lambda: rviz.matching)
+        now_ns = time.time_ns()
+        for stamp_ns in (now_ns, 0, 12_000 * MS if changes is SIMULATED else now_ns):
+            rviz.publish(pose_stamped(stamp_ns, Pose2(1.0, 2.0, 0.5), 0.5))
+        rviz.publish(pose_stamped(now_ns, Pose2(1.0, 2.0, 0.5), 0.5, frame="odom"))
+        assert eventually(lambda: len(own.inputs) == 3 and bool(own.counts()))
+        assert own.counts() == {("r1/initialpose", "wrong_frame"): 1}
+        for given in own.inputs:
+            assert isinstance(given, InitialPose)
+            assert (given.x_m, given.y_m, given.heading_rad) == pytest.approx((1.0, 2.0, 0.5))
+            assert now_ns <= given.stamp_ns <= time.time_ns()
+        own.bridge.look_for_findings()
+        assert "initialpose" not in "".join(own.bridge.findings)  # nobody need publish it
+
+
+@pytest.mark.parametrize("changes", [(), BEHIND_DDS])
+def test_static_transforms_that_came_before_the_bridge_count(
+    changes: tuple[tuple[str, str], ...],
+) -> None:
+    places = {"transforms": [static("base_link", "camera", (0.4, 0.0, 0.3), OPTICAL)]}
+    team = lab(("[robots.r2]", '[robots.r2]\nros2 = { map_frame = "r2/map" }'), *changes)
+    endpoint = free_endpoint()
+    assert team.ros2 is not None
+    ours = node_settings(team.ros2, [endpoint])
+    settings = NodeSettings(connect=(endpoint,), name="robots", layout=ours.layout)
+    with (
+        open_router(team.name, [endpoint]),
+        open_bus(team.name, [endpoint]) as bus,
+        open_node(settings) as robots,
+    ):
+        robots.publisher("r1/tf_static", types.TRANSFORMS, LATCHED).publish(
+            message(types.TRANSFORMS, **places)
+        )
+        with open_node(ours) as node:
+            bridge = TeamBridge(team, list(team.robots), node, bus, time.time_ns)
+            heard: list[Received] = []
+            robots.subscribe("r2/tf_static", types.TRANSFORMS, heard.append, STATIC_TRANSFORMS)
+            infos = robots.publisher("r1/camera_info", types.CAMERA_INFO)
+
+            def findings() -> str:
+                infos.publish(camera_info(header=_header(time.time_ns())))
+                bridge.look_for_findings()
+                return "\n".join(bridge.findings)
+
+            assert eventually(lambda: "mounted at x_m = 0.400, y_m = 0.000" in findings())
+            assert eventually(lambda: bool(heard))
+            (own_map,) = heard[0].message.transforms
+            assert (own_map.header.frame_id, own_map.child_frame_id) == ("map", "r2/map")
+            assert own_map.transform.rotation.w == 1.0
 
 
 def test_the_bridge_says_what_it_does_not_hear() -> None:

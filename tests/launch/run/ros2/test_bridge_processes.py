@@ -1,5 +1,6 @@
 """The bridge as a process: a team that hears ROS 2 alone, and restarts of routers."""
 
+import math
 import os
 import signal
 import subprocess
@@ -15,7 +16,7 @@ import pytest
 from support.key_commands import keys
 from support.processes import command_line, eventually
 from support.programs import Program, programs
-from support.ros2 import odometry
+from support.ros2 import odometry, pose_stamped
 from support.ros2_robots import (
     BusDrivers,
     Player,
@@ -39,6 +40,7 @@ from cpcbl_transport.decoding import decode_by_key
 from cpcbl_transport.messages import Refusal
 from cpcbl_transport.ros2 import messages as types
 from cpcbl_transport.ros2.node import NodeSettings, RosNode, open_node
+from cpcbl_transport.ros2.subscription import Received
 from cpcbl_transport.zenoh_bus import ZenohBus, open_bus
 
 ROS2 = '[ros2]\n[defaults.ros2]\ndetections_3d = "detections_3d"\n'
@@ -228,6 +230,7 @@ def test_a_robot_starts_its_bridge_and_ends_it(tmp_path: Path) -> None:
     ) as running:
         with open_node(NodeSettings(connect=(ros,))) as node:
             assert eventually(robot_hears(node, running["robot"]))
+            assert eventually(robot_goes_where_rviz_says(node, robot_hears(node, running["robot"])))
         assert "node cpcbl_bridge_r1 in ROS 2" in running["robot"].said
 
 
@@ -241,6 +244,28 @@ def robot_hears(node: RosNode, robot: Program) -> Callable[[], bool]:
         return "r1: first odometry" in robot.said
 
     return is_heard
+
+
+def robot_goes_where_rviz_says(node: RosNode, drive: Callable[[], bool]) -> Callable[[], bool]:
+    """Whether the pose of r1 is the one that somebody gives it once."""
+    poses: list[tuple[float, float]] = []
+
+    def note(received: Received) -> None:
+        position = received.message.pose.pose.position
+        poses.append((position.x, position.y))
+
+    node.subscribe("r1/amcl_pose", types.POSE, note)
+    rviz, sent = node.publisher("r1/initialpose", types.POSE), list[int]()
+
+    def is_there() -> bool:
+        drive()
+        if poses and rviz.matching and not sent:
+            assert math.hypot(*poses[-1]) < 0.5  # its start
+            sent.append(time.time_ns())
+            rviz.publish(pose_stamped(sent[0], Pose2(2.0, 1.0, 0.5), 0.3))
+        return bool(sent) and math.dist(poses[-1], (2.0, 1.0)) < 0.5
+
+    return is_there
 
 
 def test_the_bridge_of_a_secured_team_has_a_certificate_of_its_own(tmp_path: Path) -> None:
@@ -279,6 +304,11 @@ def plain_router(folder: Path, endpoint: str) -> Path:
     [
         (("connect", "connec"), "ros2.connec: unknown key; did you mean 'connect'?"),
         (('["{ros}"]', '["rmw:7447"]'), "ros2.connect: 'rmw:7447': no endpoint"),
+        (
+            ("[robots.r1]", '[robots.r1]\nros2 = {{ map_frame = "m", tf_static = "" }}'),
+            "map_frame: no",
+        ),
+        (("[robots.r1]", '[robots.r1]\nros2 = {{ odometry_frame = "map" }}'), "odometry_frame: is"),
         (('["{ros}"]', '["tls/a:1"]'), "ros2.connect: 'tls/a:1': needs certificates"),
     ],
 )

@@ -12,7 +12,12 @@ from support.ros2 import MS, T0, lab, message, pose_stamped
 from cpcbl_agents.vision.camera import Camera
 from cpcbl_agents.vision.pictures import decode_frame
 from cpcbl_launch.run.ros2.planar import covariance_36, header_fields, pose_fields
-from cpcbl_launch.run.ros2.positions_in import east_north, position_of_fix, position_of_pose
+from cpcbl_launch.run.ros2.positions_in import (
+    east_north,
+    initial_pose_of,
+    position_of_fix,
+    position_of_pose,
+)
 from cpcbl_launch.run.ros2.refused import BadMessage, Refused
 from cpcbl_launch.run.ros2.sensors_in import (
     frame_of_compressed,
@@ -24,7 +29,7 @@ from cpcbl_launch.run.ros2.stamps import SimulatedStamps, UnixStamps
 from cpcbl_team.config import Datum, Ros2RobotSettings
 from cpcbl_team.config.ros2 import DetectionFrame
 from cpcbl_team.geometry import Pose2
-from cpcbl_team.inputs import Position, Sightings
+from cpcbl_team.inputs import InitialPose, Position, Sightings
 from cpcbl_transport.messages import Frame
 from cpcbl_transport.ros2 import messages as types
 
@@ -74,6 +79,21 @@ def test_a_detection_in_the_optical_frame_is_where_the_camera_model_has_it() -> 
         assert one.range_m == pytest.approx(math.hypot(2.0, 0.9))
         assert one.bearing_rad == pytest.approx(math.atan2(0.9, 2.0))
         assert one.range_sigma_m is None
+
+
+def test_a_detection_in_a_frame_of_tf_static_is_where_that_is() -> None:
+    turn, settings = np.eye(4), lab().robots["r1"]
+    turn[:2, :2], turn[:2, 3] = [[0.0, -1.0], [1.0, 0.0]], (0.2, 0.1)  # a lidar, turned to the left
+    array = message(
+        types.DETECTIONS,
+        header=header_fields(T0, "lidar"),
+        detections=[detection_3d("door", (2.0, 0.0, 0.0))],
+    )
+    seen = sightings_of_detections(array, T0, settings, NAMES, lambda refused: None, turn)
+    assert isinstance(seen, Sightings)
+    (one,) = seen.sightings
+    assert one.range_m == pytest.approx(math.hypot(0.2, 2.1))
+    assert one.bearing_rad == pytest.approx(math.atan2(2.1, 0.2))
 
 
 def test_a_covariance_turns_with_its_frame() -> None:
@@ -206,6 +226,41 @@ def test_a_pose_is_a_position_in_the_fields_frame() -> None:
         pose={"pose": pose_fields(Pose2(0, 0, 0)), "covariance": covariance_36(*[math.nan] * 6)},
     )
     assert reason_of(position_of_pose(broken, T0, "map", None)) is BadMessage.NOT_FINITE
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        ({}, None),
+        ({"frame": "r1/map"}, None),
+        ({"frame": "odom"}, BadMessage.WRONG_FRAME),
+        ({"frame": ""}, BadMessage.WRONG_FRAME),
+        ({"pose": Pose2(math.nan, 0.0, 0.0)}, BadMessage.NOT_FINITE),
+        ({"pose": Pose2(0.0, 0.0, math.nan)}, BadMessage.NOT_FINITE),
+        ({"sigma_m": math.nan}, BadMessage.NOT_FINITE),
+        ({"sigma_m": 0.0, "sigma_rad": 0.0}, None),
+    ],
+)
+def test_a_pose_of_rviz_is_an_initial_pose(change: Any, reason: BadMessage | None) -> None:
+    usual = {"pose": Pose2(1.0, 2.0, 0.3), "sigma_m": 0.5, "sigma_rad": math.radians(15.0)}
+    given = pose_stamped(T0, **(usual | change))
+    found = initial_pose_of(given, T0, {"map", "r1/map"})
+    assert reason_of(found) is reason
+    if reason is None:
+        assert isinstance(found, InitialPose)
+        assert (found.x_m, found.y_m, found.heading_rad) == pytest.approx((1.0, 2.0, 0.3))
+        rviz = 0.25, 0.0, 0.25, 0.0, 0.0, math.radians(15.0) ** 2
+        assert found.covariance == pytest.approx(rviz)
+
+
+def test_an_initial_pose_without_a_rotation_or_a_covariance_is_refused() -> None:
+    given = pose_stamped(T0, Pose2(1.0, 2.0, 0.3), 0.5)
+    given.pose.pose.orientation.w = given.pose.pose.orientation.z = 0.0
+    assert reason_of(initial_pose_of(given, T0, {"map"})) is BadMessage.ZERO_QUATERNION
+    numbers = covariance_36(0.25, 0.0, -0.25, 0.0, 0.0, 0.1)
+    pose = {"pose": pose_fields(Pose2(0.0, 0.0, 0.0)), "covariance": numbers}
+    given = message(types.POSE, header=header_fields(T0, "map"), pose=pose)
+    assert reason_of(initial_pose_of(given, T0, {"map"})) is BadMessage.NOT_A_COVARIANCE
 
 
 DATUM = Datum(latitude_deg=52.0, longitude_deg=13.0, x_axis_deg=90.0)  # x is north

@@ -143,6 +143,8 @@ def test_tags_that_give_no_sighting_are_said() -> None:
         (detection(7, corners * np.nan), BadMessage.NOT_FINITE, "corner"),
         (detection(7, 320.0 + 0.01 * corners), BadMessage.BAD_DETECTION, "a side of"),
         (detection(7, corners * 3.0), BadMessage.WRONG_SIZE, "640 x 480"),
+        (detection(7, corners * 1e300), BadMessage.WRONG_SIZE, "640 x 480"),
+        (detection(7, corners[[0, 2, 1, 3]]), BadMessage.BAD_DETECTION, "those of no square"),
         # A tag that hangs far lower than the team file states
         (
             detection(7, corners + np.array([0.0, 160.0])),
@@ -191,6 +193,9 @@ def test_detections_without_the_info_of_their_camera_are_refused() -> None:
         {"p": [math.nan] * 12},
         {"width": 0},
         {"p": [6000000.0, 0, 0, 0, 0, 6000000.0, 0, 0, 0, 0, 1.0, 0]},
+        {"p": [600.0, 0, 320.0, 0, 0, 6000000.0, 240.0, 0, 0, 0, 1.0, 0]},
+        {"p": [600.0, 0, 1e300, 0, 0, 600.0, 240.0, 0, 0, 0, 1.0, 0]},
+        {"binning_y": 4000},  # of 480 rows
     ],
 )
 def test_a_camera_info_that_cannot_be_used(fields: dict[str, Any]) -> None:
