@@ -61,18 +61,23 @@ def until_it(act: Callable[[], None], has_worked: Callable[[], bool]) -> None:
     raise AssertionError("nothing has come of it")
 
 
+def settings_of_nodes(team: Team, endpoint: str) -> tuple[NodeSettings, NodeSettings]:
+    """The settings of the bridge's node, and those of the robots' node in the same layout."""
+    assert team.ros2 is not None
+    ours = node_settings(team.ros2, [endpoint])
+    return ours, NodeSettings(connect=(endpoint,), name="robots", layout=ours.layout)
+
+
 @contextmanager
 def stand(team: Team, now_ns: Callable[[], int] = time.time_ns) -> Iterator[Stand]:
     endpoint = free_endpoint()
-    assert team.ros2 is not None
-    ours = node_settings(team.ros2, [endpoint])
-    settings = NodeSettings(connect=(endpoint,), name="robots", layout=ours.layout)
+    ours, of_robots = settings_of_nodes(team, endpoint)
     with (
         open_router(team.name, [endpoint]),
         open_bus(team.name, [endpoint]) as own,
         open_bus(team.name, [endpoint]) as bus,
         open_node(ours) as node,
-        open_node(settings) as robots,
+        open_node(of_robots) as robots,
     ):
         inputs: list[Any] = []
         bus.subscribe("in/**", lambda key, payload: inputs.append(decode_by_key(key, payload)))
@@ -223,13 +228,11 @@ def test_static_transforms_that_came_before_the_bridge_count(
     places = {"transforms": [static("base_link", "camera", (0.4, 0.0, 0.3), OPTICAL)]}
     team = lab(("[robots.r2]", '[robots.r2]\nros2 = { map_frame = "r2/map" }'), *changes)
     endpoint = free_endpoint()
-    assert team.ros2 is not None
-    ours = node_settings(team.ros2, [endpoint])
-    settings = NodeSettings(connect=(endpoint,), name="robots", layout=ours.layout)
+    ours, of_robots = settings_of_nodes(team, endpoint)
     with (
         open_router(team.name, [endpoint]),
         open_bus(team.name, [endpoint]) as bus,
-        open_node(settings) as robots,
+        open_node(of_robots) as robots,
     ):
         robots.publisher("r1/tf_static", types.TRANSFORMS, LATCHED).publish(
             message(types.TRANSFORMS, **places)
