@@ -131,7 +131,8 @@ class CollaborationAgent:
         self._never_ns = self._from_ns - int(gains.UNKNOWN_AGE_S * 1e9)  # in place of a last help
         self._belief_sent_ns = self._never_ns
         self._has_subscribers = False
-        self.may_mislead = False  # what its pose is not confirmed for would mislead teammates
+        self.may_mislead = False
+        """Whether its pose is not confirmed and may be wrong, so that help would mislead."""
         self.counters = MessageCounters()
         self.tier = LOWEST_TIER
         self.latest: agent.PoseEstimate | None = None
