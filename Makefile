@@ -97,11 +97,12 @@ compiled: setup
 	cd $(COMPILED) && MYPYPATH=../../tests $(abspath $(BIN))/mypyc --namespace-packages \
 	  --explicit-package-bases --ignore-missing-imports benchmarks/float_ekf.py > mypyc.log
 
-# The variants of the localizer and their peers of the extra `bench` compute the same.
+# The variants of the localizer and their peers of the extra `bench` compute the same; so do a cluster
+# and this machine.
 test-bench: setup compiled
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev,bench]'
 	$(BIN)/pytest -q tests/benchmarks/test_contenders.py tests/benchmarks/test_compiled.py \
-	  tests/benchmarks/test_viewers.py
+	  tests/benchmarks/test_viewers.py tests/launch/lab/test_seeds.py
 
 # Timed, so alone on the machine: the localizer's variants and their peers in the same run, then a
 # robot's detector and OpenCV's marker detection.

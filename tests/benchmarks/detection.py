@@ -23,7 +23,8 @@ from msgspec import Struct
 from msgspec.structs import replace
 from rich.console import RenderableType
 
-from cpcbl_launch.lab.experiments.runs import ExperimentResult, map_in_processes
+from cpcbl_launch.lab.experiments.runs import ExperimentResult
+from cpcbl_launch.lab.seeds import Workers, run_seeds
 from cpcbl_launch.reporting.metrics import degrees
 from cpcbl_launch.reporting.tables import cells, number, table
 from cpcbl_launch.team.file import builtin_path, load_team
@@ -149,7 +150,7 @@ def measure(count: int, seed: int, jobs: int | None, done: Callable[[], None]) -
 
     starts = range(0, count, CHUNK)
     tasks = [(seed, start, min(CHUNK, count - start)) for start in starts]
-    return summarize(count, seed, map_in_processes(evaluate_frames, tasks, jobs, done))
+    return summarize(count, seed, run_seeds(evaluate_frames, tasks, Workers(jobs), done))
 
 
 def summarize(count: int, seed: int, batches: Sequence[Batch]) -> DetectionReport:

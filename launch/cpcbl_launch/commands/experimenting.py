@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from rich.console import RenderableType
 
     from cpcbl_launch.lab.experiments.runs import Experiment
+    from cpcbl_launch.lab.seeds import Workers
 
 experiment_app = Typer(
     help="The paper's experiments and others: each prints a table and writes NAME.json; most of"
@@ -26,7 +27,6 @@ experiment_app = Typer(
 FILE_WIDTH = 110
 
 Seeds = Annotated[int, Option(min=1, help="Runs of each case, each with its own noise.")]
-Jobs = Annotated[Optional[int], Option(min=1, help="Processes at a time; default: all cores.")]
 Output = Annotated[Path, Option(help="Folder for NAME.json and NAME.png.")]
 
 
@@ -35,13 +35,14 @@ def _add_command(name: str, where: str, runs: int, text: str) -> None:
 
     def command(
         seeds: Seeds = runs,
-        jobs: Jobs = None,
+        jobs: options.Jobs = None,
+        cluster: options.Cluster = "",
         output: Output = Path(),
         as_json: options.AsJson = False,
     ) -> None:
         module, attribute = where.split(":")
         experiment = getattr(import_module(f"cpcbl_launch.lab.experiments.{module}"), attribute)
-        conduct(experiment, seeds, jobs, output, as_json)
+        conduct(experiment, seeds, options.workers(jobs, cluster), output, as_json)
 
     experiment_app.command(name, help=text)(command)
 
@@ -72,7 +73,8 @@ _add_command(
 @experiment_app.command("one-way-vs-both")
 def one_way_vs_both(
     seeds: Seeds = 3,
-    jobs: Jobs = None,
+    jobs: options.Jobs = None,
+    cluster: options.Cluster = "",
     output: Output = Path(),
     as_json: options.AsJson = False,
     team_sizes: Annotated[str, Option(help="Sizes of the teams.")] = "2,5,10,20",
@@ -81,7 +83,8 @@ def one_way_vs_both(
     from cpcbl_launch.lab.experiments.directions import experiment_of_sizes
 
     sizes = [int(s) if s.strip().isdecimal() else 0 for s in team_sizes.split(",")]
-    conduct(experiment_of_sizes(sizes), seeds, jobs, output, as_json)
+    where = options.workers(jobs, cluster)
+    conduct(experiment_of_sizes(sizes), seeds, where, output, as_json)
 
 
 @experiment_app.command("budget")
@@ -97,7 +100,8 @@ def budget(
         str, Option(help="Their world: mixed, few-landmarks, one-observer or chain.")
     ] = "mixed",
     seeds: Seeds = 3,
-    jobs: Jobs = None,
+    jobs: options.Jobs = None,
+    cluster: options.Cluster = "",
     output: Output = Path(),
     as_json: options.AsJson = False,
 ) -> None:
@@ -116,7 +120,7 @@ def budget(
         logged = logged_team.with_duration(logged_team.load_logged_team(team, data), duration)
         team = with_blind_robots(logged.team, options.parse_names(blind), logged.left_out)
         runs = experiment.runs_of_log(logged._replace(team=team))
-    measure = partial(experiment.measure_curve, runs, jobs)
+    measure = partial(experiment.measure_curve, runs, options.workers(jobs, cluster))
     total = len(experiment.cases())
     _conduct("budget", measure, experiment.tables, output, as_json, total=total)
 
@@ -136,7 +140,8 @@ def worlds(
         str, Option("--worlds", help='Words in the names of worlds: "landmark,helper".')
     ] = "",
     variants: Annotated[str, Option(help="Variants to compare.")] = "joint,oval,circular",
-    jobs: Jobs = None,
+    jobs: options.Jobs = None,
+    cluster: options.Cluster = "",
     output: Output = Path(),
     as_json: options.AsJson = False,
 ) -> None:
@@ -144,7 +149,8 @@ def worlds(
     from cpcbl_launch.lab.experiments import worlds as experiment
 
     cases = partial(experiment.cases, options.parse_names(names), options.parse_names(variants))
-    conduct(experiment.EXPERIMENT._replace(cases=cases), seeds, jobs, output, as_json)
+    where = options.workers(jobs, cluster)
+    conduct(experiment.EXPERIMENT._replace(cases=cases), seeds, where, output, as_json)
 
 
 MOVED = {
@@ -169,7 +175,7 @@ for _name, _target in MOVED.items():
 
 
 def conduct(
-    experiment: "Experiment", seeds: int, jobs: int | None, output: Path, as_json: bool
+    experiment: "Experiment", seeds: int, where: "Workers", output: Path, as_json: bool
 ) -> None:
     """Runs, writes and shows one experiment of cases and seeds. Raises CpcblError."""
     if experiment.needs_opencv:
@@ -177,7 +183,7 @@ def conduct(
     cases = experiment.cases()
 
     def measure(done: Callable[[], None]) -> Any:
-        return experiment.outcome(experiment.results(cases, seeds, jobs, done))
+        return experiment.outcome(experiment.results(cases, seeds, where, done))
 
     name, tables, drawn = experiment.name, experiment.tables, experiment.drawn
     _conduct(name, measure, tables, output, as_json, total=len(cases) * seeds, drawn=drawn)

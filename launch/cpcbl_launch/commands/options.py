@@ -6,7 +6,7 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from typer import Argument, CallbackParam, Context, Exit, Option, secho
 
@@ -15,6 +15,9 @@ from cpcbl_launch.run.containers import BASE_VARIABLE
 from cpcbl_launch.team.file import builtin_path, find_team
 from cpcbl_launch.team.requirements import require_endpoints, require_matplotlib
 from cpcbl_team.errors import InputError
+
+if TYPE_CHECKING:
+    from cpcbl_launch.lab.seeds import Workers
 
 
 def require_folder(option: str, folder: Path) -> None:
@@ -114,6 +117,14 @@ MatchMessages = Annotated[
     Option(min=0, help="Fixes and beliefs that the team may send in a match; 0: no limit."),
 ]
 NoiseSeed = Annotated[int, Option(help="Seed of the simulated noise.")]
+Jobs = Annotated[int | None, Option(min=1, help="Processes at a time; default: all cores.")]
+Cluster = Annotated[
+    str,
+    Option(
+        metavar="ADDRESS",
+        help="Run on the Dask cluster of this scheduler, e.g. tcp://10.0.0.2:8786, not here.",
+    ),
+]
 ReportFile = Annotated[
     Path | None, Option(callback=writable_file, help="File to write the report into, as JSON.")
 ]
@@ -143,6 +154,15 @@ PageListen = Annotated[
 OpenPage = Annotated[bool, Option("--open", help="Open the page in a browser of this machine.")]
 ClockText = Annotated[str, Option("--clock", hidden=True)]
 Parent = Annotated[int | None, Option(hidden=True)]
+
+
+def workers(jobs: int | None, cluster: str) -> "Workers":
+    """What `--jobs` and `--cluster` ask for. Raises InputError for both."""
+    from cpcbl_launch.lab.seeds import Workers
+
+    if cluster and jobs is not None:
+        raise InputError(f"--jobs {jobs}: not with --cluster, whose workers run all; leave one out")
+    return Workers(jobs, cluster)
 
 
 def write_report(path: Path | None, result: object) -> dict[str, str]:

@@ -23,6 +23,7 @@ from cpcbl_launch.lab.experiments.runs import (
     spread,
     with_settings,
 )
+from cpcbl_launch.lab.seeds import Workers
 from cpcbl_launch.reporting.metrics import pose_errors
 from cpcbl_team.config import Team
 from cpcbl_team.errors import InputError
@@ -69,7 +70,7 @@ def test_an_experiment_writes_json_and_picture_and_shows_a_table(
     name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = tmp_path / "new"
-    conduct(small(EVERY[name]), seeds=1, jobs=1, output=folder, as_json=False)
+    conduct(small(EVERY[name]), seeds=1, where=Workers(1), output=folder, as_json=False)
     shown = capsys.readouterr().out
     assert "…" not in shown
     assert all(len(line) <= 80 for line in shown.splitlines() if not line.startswith("written"))
@@ -81,7 +82,9 @@ def test_an_experiment_writes_json_and_picture_and_shows_a_table(
 
 
 def test_as_json_prints_what_is_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    conduct(small(EVERY["one-way-vs-both"]), seeds=1, jobs=1, output=tmp_path, as_json=True)
+    conduct(
+        small(EVERY["one-way-vs-both"]), seeds=1, where=Workers(1), output=tmp_path, as_json=True
+    )
     printed = capsys.readouterr().out
     assert printed == (tmp_path / "one-way-vs-both.json").read_text()
 
@@ -105,7 +108,7 @@ def test_the_number_of_jobs_changes_no_figure() -> None:
     experiment = small(EVERY["figure7"])
     cases, done = experiment.cases(), []
     outcomes = [
-        experiment.outcome(experiment.results(cases, 2, jobs, lambda: done.append(1)))
+        experiment.outcome(experiment.results(cases, 2, Workers(jobs), lambda: done.append(1)))
         for jobs in (1, 2)
     ]
     assert len(done) == 2 * len(cases) * 2
@@ -216,7 +219,7 @@ def test_a_wrong_option_is_one_line(tmp_path: Path) -> None:
 def outcome_of(
     experiment: Experiment, seeds: int, cases: Mapping[Any, Case], jobs: int = 1
 ) -> Outcome:
-    found = experiment.outcome(experiment.results(cases, seeds, jobs, lambda: None))
+    found = experiment.outcome(experiment.results(cases, seeds, Workers(jobs), lambda: None))
     assert isinstance(found, Outcome)
     return found
 
@@ -248,7 +251,9 @@ def test_a_sharper_camera_helps_a_cheap_one(tmp_path: Path) -> None:
     def cases() -> Mapping[Any, Case]:
         return {c: case._replace(loops=1) for c, case in experiment.cases().items()}
 
-    conduct(experiment._replace(cases=cases), seeds=1, jobs=2, output=tmp_path, as_json=False)
+    conduct(
+        experiment._replace(cases=cases), seeds=1, where=Workers(2), output=tmp_path, as_json=False
+    )
     written = json.loads((tmp_path / "figure7-cameras.json").read_text())
     assert (tmp_path / "figure7-cameras.png").read_bytes().startswith(PNG)
     sensing = {name: r["sensing"] for name, r in written["teams"]["F"]["robots"].items()}

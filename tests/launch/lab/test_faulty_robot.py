@@ -19,6 +19,7 @@ from cpcbl_launch.lab.faulty_robot import (
     FaultyBus,
     faulty_command,
 )
+from cpcbl_launch.lab.seeds import Workers
 from cpcbl_launch.run.processes import PROGRAM
 from cpcbl_launch.team.file import builtin_path
 from cpcbl_team.errors import InputError
@@ -229,7 +230,7 @@ def test_it_is_shown_in_80_columns_and_drawn(
 def test_every_fault_is_detected_beside_two_correct_observers() -> None:
     faults = [case for case in liars.cases() if isinstance(case, liars.Case)]
     cases = [case for case in faults if case.honest == 2 and case.trust]
-    runs = liars.EXPERIMENT.results({case: case for case in cases}, 4, 2, lambda: None)
+    runs = liars.EXPERIMENT.results({case: case for case in cases}, 4, Workers(2), lambda: None)
     result = liars.outcome(runs)
     assert result.held
     for row in result.rows:

@@ -7,7 +7,6 @@ from support.processes import command_line
 from support.sweeps import over_seeds
 
 from cpcbl_launch.lab.experiments import world_list
-from cpcbl_launch.lab.experiments.runs import map_in_processes
 from cpcbl_launch.lab.experiments.worlds import (
     VARIANTS,
     LossyBus,
@@ -17,6 +16,7 @@ from cpcbl_launch.lab.experiments.worlds import (
     run_world,
     verdict,
 )
+from cpcbl_launch.lab.seeds import Workers, run_seeds
 from cpcbl_team.errors import InputError
 from cpcbl_transport import topics
 from cpcbl_transport.memory_bus import MemoryHub
@@ -110,7 +110,7 @@ def figures(names: tuple[str, ...], variants: tuple[str, ...], seeds: int) -> di
     """The verdict of each world and variant."""
     chosen = cases(names, variants)
     tasks = [(world, seed) for world in chosen.values() for seed in range(1, seeds + 1)]
-    runs = map_in_processes(run_world, tasks, 1 if seeds < 10 else None, lambda: None)
+    runs = run_seeds(run_world, tasks, Workers(1 if seeds < 10 else None))
     return {
         f"{world}, {variant}": row(world, variant, runs[i * seeds : (i + 1) * seeds])["verdict"]
         for i, (world, variant) in enumerate(chosen)

@@ -20,7 +20,8 @@ from rich.console import RenderableType
 
 from cpcbl_launch.lab.evaluation import evaluate_log
 from cpcbl_launch.lab.experiments.mixed_teams import mixed_team
-from cpcbl_launch.lab.experiments.runs import ExperimentResult, map_in_processes
+from cpcbl_launch.lab.experiments.runs import ExperimentResult
+from cpcbl_launch.lab.seeds import Workers, run_seeds
 from cpcbl_launch.reporting.recorder import Report, mean_score
 from cpcbl_launch.reporting.tables import cells, table
 from cpcbl_launch.run.logged_team import LoggedTeam
@@ -241,10 +242,10 @@ def _blind(team: Team) -> tuple[str, ...]:
     return tuple(n for n, r in team.robots.items() if not r.sensor.sees_landmarks)
 
 
-def measure_curve(runs: Runs, jobs: int | None, done: Callable[[], None]) -> Curve:
+def measure_curve(runs: Runs, where: Workers, done: Callable[[], None]) -> Curve:
     """All points; `done` is called after each. The same runs give the same figures."""
     tasks = [(runs, case) for case in cases()]
-    points = tuple(map_in_processes(measure_point, tasks, jobs, done))
+    points = tuple(run_seeds(measure_point, tasks, where, done))
     return Curve(
         experiment="budget",
         log=runs.name,

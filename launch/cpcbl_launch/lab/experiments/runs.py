@@ -8,19 +8,16 @@ restarts, failed: it is counted as such, and has no part in the other figures.
 """
 
 import math
-import os
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from importlib.metadata import version
-from itertools import starmap
-from multiprocessing import get_context
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import numpy as np
 from msgspec import Struct, field
 from msgspec.structs import asdict, replace
 from rich.console import RenderableType
 
+from cpcbl_launch.lab.seeds import Workers, run_seeds
 from cpcbl_launch.reporting import metrics
 from cpcbl_launch.reporting.metrics import Floats, Samples, Score
 from cpcbl_launch.reporting.recorder import Recorder
@@ -38,7 +35,6 @@ LOOPS = 5
 MOST_RESTARTS = 30
 OTHER_NOISE = 1_000_003  # from the seed of one attempt to that of the next
 LOOPS_LIMIT_S = 400.0  # five loops take 70 s
-Result = TypeVar("Result")
 
 
 class Case(NamedTuple):
@@ -128,26 +124,6 @@ def _figures(case: Case, recorder: Recorder, referee: LoopReferee, restarts: int
     )
 
 
-def map_in_processes(
-    function: Callable[..., Result],
-    tasks: Sequence[tuple[Any, ...]],
-    jobs: int | None,
-    done: Callable[[], None],
-) -> list[Result]:
-    """The function's results for each task's arguments, in the order of the tasks.
-
-    `jobs` processes work at a time (None: one a core); `done` is called after each task.
-    """
-    results = []
-    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
-        alone = jobs == 1 or os.cpu_count() == 1  # then in this process
-        each = starmap(function, tasks) if alone else pool.map(function, *zip(*tasks, strict=True))
-        for result in each:
-            results.append(result)
-            done()
-    return results
-
-
 # Teams on the circuit (`teams/circuit.toml`) ------------------------------------------------------
 
 
@@ -186,11 +162,11 @@ class Experiment(NamedTuple):
     drawn: bool = True
 
     def results(
-        self, cases: Mapping[Any, Any], seeds: int, jobs: int | None, done: Callable[[], None]
+        self, cases: Mapping[Any, Any], seeds: int, where: Workers, done: Callable[[], None]
     ) -> Results:
         """These cases with seeds from 1 to `seeds`; `done` is called after each run."""
         tasks = [(case, seed) for case in cases.values() for seed in range(1, seeds + 1)]
-        runs = map_in_processes(self.run, tasks, jobs, done)
+        runs = run_seeds(self.run, tasks, where, done)
         return {key: runs[i * seeds : (i + 1) * seeds] for i, key in enumerate(cases)}
 
 
