@@ -23,6 +23,8 @@ from cpcbl_agents.flight_recorder.entries import (
     TokenTaken,
     Undeclared,
 )
+from cpcbl_agents.flight_recorder.states import StateError, decode_state, encode_state
+from cpcbl_agents.node import NO_CALLBACKS
 from cpcbl_agents.sources import OwnCamera
 from cpcbl_agents.tape import SourceT, Tape
 from cpcbl_launch.recordings.differences import DifferenceError
@@ -45,6 +47,8 @@ class Playback(Tape):
 
     Raises DifferenceError where the node does something else than it did.
     """
+
+    restored_as = ("tape",)
 
     def __init__(self, on_put: OnPut = ignore) -> None:
         self._on_put = on_put
@@ -101,6 +105,41 @@ class Playback(Tape):
             self._answers[question] = entry.answer
         return self._answers.get(question)
 
+    def state(self, node: object) -> bytes:
+        """The state of the node that plays this, and with it what goes on to be answered."""
+        return encode_state([node, self._answers])
+
+    def restored(self, state: bytes) -> Any:
+        """The node of this state, which plays this from now on. Raises StateError."""
+        try:
+            node, self._answers = decode_state(state, self._restore)
+        except ValueError as error:
+            raise StateError("no state of a node") from error
+        return node
+
+    def _restore(self, name: str, *parts: Any) -> Any:
+        """What belongs to the world of a node: here all of it is played."""
+        match name, *parts:
+            case ["tape"]:
+                return self
+            case ["bus"]:
+                return PlayedBus(self)
+            case ["arrivals"]:
+                return _PlayedArrivals(self, "", "", (), lambda: None)
+            case ["handle", str(what), str(key)]:
+                return _PlayedHandle(what, key, self)
+            case ["publisher", str(key)]:
+                return _PlayedPublisher(key, self)
+            case ["source", str(source), int() | None as next_ns, bool(is_finished)]:
+                return PlayedSource(source, self, next_ns, is_finished)
+            case ["detection"]:
+                return _PlayedDetection(self)
+            case ["detector"]:
+                return None
+            case ["callbacks"]:
+                return NO_CALLBACKS
+        raise StateError(f"needs {name!r:.40}")
+
     def forget(self, question: str) -> None:
         self._answers.pop(question, None)
 
@@ -126,7 +165,9 @@ class Playback(Tape):
         return _PlayedArrivals(self, robot, incarnation, team, on_arrival)
 
     def wrap_source(self, name: str, source: SourceT) -> SourceT:
-        return cast(SourceT, PlayedSource(name, self))
+        played = PlayedSource(name, self)
+        played.poll(0)  # what comes next in it, from the start
+        return cast(SourceT, played)
 
     def wrap_detection(self, detection: Detection) -> Detection:
         return _PlayedDetection(self)
@@ -134,6 +175,8 @@ class Playback(Tape):
 
 class _PlayedArrivals(Arrivals):
     """What the node took."""
+
+    restored_as = ("arrivals",)
 
     def __init__(
         self,
@@ -182,6 +225,8 @@ class _PlayedArrivals(Arrivals):
 class PlayedBus(Bus):
     """Compares what the node declares and puts."""
 
+    restored_as = ("bus",)
+
     def __init__(self, playback: Playback) -> None:
         self._playback = playback
 
@@ -189,13 +234,17 @@ class PlayedBus(Bus):
         return _PlayedPublisher(key, self._playback)
 
     def subscribe(self, keys: str, on_message: MessageCallback) -> Handle:
-        return _PlayedHandle("subscription", keys, self._playback)
+        return self._declare("subscription", keys)
 
     def declare_token(self, key: str) -> Handle:
-        return _PlayedHandle("token", key, self._playback)
+        return self._declare("token", key)
 
     def watch_liveliness(self, keys: str, on_change: LivelinessCallback) -> Handle:
-        return _PlayedHandle("watch", keys, self._playback)
+        return self._declare("watch", keys)
+
+    def _declare(self, what: str, key: str) -> Handle:
+        self._playback.compare(Declared(what, key))
+        return _PlayedHandle(what, key, self._playback)
 
     def close(self) -> None:
         """There is nothing to close."""
@@ -204,7 +253,7 @@ class PlayedBus(Bus):
 class _PlayedHandle(Handle):
     def __init__(self, what: str, key: str, playback: Playback) -> None:
         self._undeclared, self._playback = Undeclared(what, key), playback
-        playback.compare(Declared(what, key))
+        self.restored_as = ("handle", what, key)
 
     def close(self) -> None:
         self._playback.compare(self._undeclared)
@@ -213,6 +262,7 @@ class _PlayedHandle(Handle):
 class _PlayedPublisher(Publisher):
     def __init__(self, key: str, playback: Playback) -> None:
         self._key, self._playback = key, playback
+        self.restored_as = ("publisher", key)
 
     @property
     def matching(self) -> bool:
@@ -229,11 +279,21 @@ class PlayedSource(OwnCamera):
     """What the robot's own log or camera had."""
 
     next_ns: int | None = None
-    is_finished = False
+    is_finished: bool = False
 
-    def __init__(self, name: str, playback: Playback) -> None:
+    def __init__(
+        self,
+        name: str,
+        playback: Playback,
+        next_ns: int | None = None,
+        is_finished: bool = False,
+    ) -> None:
         self._name, self._playback = name, playback
-        self.poll(0)
+        self.next_ns, self.is_finished = next_ns, is_finished
+
+    @property
+    def restored_as(self) -> tuple[str, str, int | None, bool]:
+        return "source", self._name, self.next_ns, self.is_finished
 
     @property
     def counts(self) -> Counter[str]:
@@ -252,6 +312,8 @@ class PlayedSource(OwnCamera):
 
 class _PlayedDetection(Detection):
     """What was found in the frames, whether or not their images were kept."""
+
+    restored_as = ("detection",)
 
     def __init__(self, playback: Playback) -> None:
         self._playback = playback

@@ -1,14 +1,21 @@
 """Runs the nodes of a recorded run again, on what they took, and compares what comes out."""
 
+from itertools import islice
+
 import msgspec
 from msgspec.structs import replace
 
+from cpcbl_agents.flight_recorder import program_version
 from cpcbl_agents.flight_recorder.entries import Step
+from cpcbl_agents.flight_recorder.states import StateError
 from cpcbl_agents.node import GuestNode, Node, NodeStart
 from cpcbl_agents.robot import Robot, build_sensing
+from cpcbl_agents.sources.mrclam import LogError
 from cpcbl_launch.recordings.differences import Difference, DifferenceError
 from cpcbl_launch.recordings.playback import OnPut, Playback, PlayedBus, PlayedSource, ignore
 from cpcbl_launch.recordings.read import Process
+from cpcbl_launch.recordings.state_files import NodeState
+from cpcbl_launch.team.faults import one_line
 
 
 class Replayed(msgspec.Struct, frozen=True, kw_only=True):
@@ -16,26 +23,59 @@ class Replayed(msgspec.Struct, frozen=True, kw_only=True):
 
     robot: str
     incarnation: str
+    version: str  # that recorded it
     steps: int
     messages: int
-    seconds: float  # of the robot's time
+    seconds: float  # since its start, by the robot's clock, to the latest step
     difference: Difference | None = None
     damage: tuple[str, ...] = ()
 
 
 class Replay:
-    """The node of one process, which is stepped as it was."""
+    """The node of one process, which is stepped as it was.
 
-    def __init__(self, process: Process, on_put: OnPut = ignore) -> None:
+    It begins with the first step that is there, or after that of `state`. Raises LogError where
+    that cannot be: the state is of another process or version, or the begin of the recording is
+    missing.
+    """
+
+    def __init__(
+        self, process: Process, on_put: OnPut = ignore, state: NodeState | None = None
+    ) -> None:
+        header = process.header
         self._process, self.damage = process, list[str]()
         self.playback = Playback(on_put)
+        self.difference: Difference | None = None
+        self.node: Node | None = None
+        self.now_ns, self.number = header.start_ns, header.first_step - 1  # of the latest step
+        self.begun_at = self.number + 1
         self._steps = process.steps(self.damage)
-        self.number = -1  # of the latest step
-        self.now_ns = process.header.start_ns
+        if state is not None:
+            state.require_process(header.robot, header.incarnation)
+            for _ in islice(self._steps, state.step + 1 - header.first_step):
+                pass
+            self.now_ns, self.number = state.now_ns, state.step
+            self.node = self._restored(state.state, state.version, state.where)
+        elif header.first_step:
+            where = str(process.segments[0].path)
+            self.node = self._restored(header.state, header.version, where)
+        self.begun_at = self.number + 1
         self.upcoming = next(self._steps, None)
         """The step that comes next; None at the end."""
-        self.node: Node | None = None
-        self.difference: Difference | None = None
+
+    def _restored(self, state: bytes, version: str, where: str) -> Node:
+        if version != program_version():
+            raise LogError(
+                f"{where}: a state of version {version}, this is {program_version()}: replay it"
+                " with that version, or from the start of the process"
+            )
+        try:
+            node = self.playback.restored(state)
+        except StateError as error:
+            raise LogError(f"{where}: no state of a robot: {one_line(str(error))}") from error
+        if not isinstance(node, Node):
+            raise LogError(f"{where}: no state of a robot")
+        return node
 
     def step(self) -> None:
         """Makes the step that comes next; to be called while there is one."""
@@ -64,12 +104,26 @@ class Replay:
             self.node.step(step.now_ns, self.playback.may_go_on)
 
     @property
+    def state(self) -> NodeState:
+        """The state after the latest step."""
+        header = self._process.header
+        return NodeState(
+            version=program_version(),
+            robot=header.robot,
+            incarnation=header.incarnation,
+            step=self.number,
+            now_ns=self.now_ns,
+            state=self.playback.state(self.node),
+        )
+
+    @property
     def result(self) -> Replayed:
         header = self._process.header
         return Replayed(
             robot=header.robot,
             incarnation=header.incarnation,
-            steps=self.number + 1,
+            version=header.version,
+            steps=self.number + 1 - self.begun_at,
             messages=self.playback.messages,
             seconds=(self.now_ns - header.start_ns) * 1e-9,
             difference=self.difference,
