@@ -29,6 +29,7 @@ COMMANDS = {
     "field": "running.field",
     "compose": "preparing.compose",
     "simulate": "measuring.simulate",
+    "merge": "recorded.merge",
     "evaluate": "measuring.evaluate",
     "chaos": "measuring.chaos",
     "list": "diagnosing.list_teams",

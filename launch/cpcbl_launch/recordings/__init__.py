@@ -1,0 +1,1 @@
+"""Runs that were recorded: reading them, and having them again."""
