@@ -6,8 +6,8 @@ so that the same inputs give the same bits.
 
 import threading
 from collections import Counter, deque
-from collections.abc import Callable
-from typing import TYPE_CHECKING, NamedTuple
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 from cpcbl_agents.sources import Picture
 from cpcbl_team.inputs import Sightings
@@ -34,15 +34,64 @@ def detect(detector: "CameraDetector", frame: Frame | Picture, annotates: bool) 
     return DetectedFrame(frame.stamp_ns, detector.detect(frame))
 
 
-class DetectionWorker:
+class Detection(Protocol):
+    """Detects in the frames that it is given; the results come now or later."""
+
+    @property
+    def counts(self) -> Counter[str]:
+        """The detector's events so far, by name."""
+
+    @property
+    def problems(self) -> tuple[str, ...]:
+        """What the detector doubts, as sentences."""
+
+    @property
+    def is_busy(self) -> bool:
+        """Whether there is a frame whose result was not collected yet."""
+
+    def submit(self, frame: Frame | Picture, annotates: bool) -> bool:
+        """One more frame; whether it takes the place of one that waits, which is skipped."""
+
+    def collect(self) -> Sequence[DetectedFrame]:
+        """The results since the last call."""
+
+
+class ImmediateDetection(Detection):
+    """Detects on the thread that gives it a frame, in the same step of the robot."""
+
+    def __init__(self, detector: "CameraDetector") -> None:
+        self._detector = detector
+        self._results: list[DetectedFrame] = []
+
+    @property
+    def counts(self) -> Counter[str]:
+        return self._detector.counts
+
+    @property
+    def problems(self) -> tuple[str, ...]:
+        return self._detector.problems
+
+    @property
+    def is_busy(self) -> bool:
+        return bool(self._results)
+
+    def submit(self, frame: Frame | Picture, annotates: bool) -> bool:
+        self._results.append(detect(self._detector, frame, annotates))
+        return False
+
+    def collect(self) -> Sequence[DetectedFrame]:
+        results, self._results = self._results, []
+        return results
+
+
+class DetectionWorker(Detection):
     """Detects in one frame at a time while the newest of the others waits. `wake` is called, on the
     worker's thread, for each result."""
 
     def __init__(self, detector: "CameraDetector", wake: Callable[[], None]) -> None:
         self._detector, self._wake = detector, wake
-        self.counts: Counter[str] = detector.counts
-        """The detector's, after the latest result; the thread replaces them and changes none."""
-        self.problems = detector.problems
+        # After the latest result: the thread replaces these two and changes none
+        self._counts, self._problems = detector.counts, detector.problems
         self._waiting: deque[tuple[Frame | Picture, bool]] = deque()
         self._results: deque[DetectedFrame] = deque()
         self._unfinished = 0  # frames whose results were not collected
@@ -52,12 +101,18 @@ class DetectionWorker:
         self._thread.start()
 
     @property
+    def counts(self) -> Counter[str]:
+        return self._counts
+
+    @property
+    def problems(self) -> tuple[str, ...]:
+        return self._problems
+
+    @property
     def is_busy(self) -> bool:
-        """Whether there is a frame whose result was not collected yet."""
         return self._unfinished > 0
 
     def submit(self, frame: Frame | Picture, annotates: bool) -> bool:
-        """One more frame; whether it takes the place of one that waits, which is skipped."""
         with self._changed:
             skips = bool(self._waiting)
             self._waiting.clear()
@@ -99,7 +154,7 @@ class DetectionWorker:
                 self._failure = error
                 self._wake()
                 return
-            self.counts, self.problems = self._detector.counts, self._detector.problems
+            self._counts, self._problems = self._detector.counts, self._detector.problems
             with self._changed:
                 self._results.append(result)
             self._wake()

@@ -1,7 +1,7 @@
 """A robot on a bus: it takes in what arrives, refuses what must not be used, and publishes."""
 
 import logging
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable, Iterable
 from typing import NamedTuple, Protocol
 
@@ -12,12 +12,11 @@ from cpcbl_agents.agent import BeliefSubscribers, FrameSubscribers
 from cpcbl_agents.clocks import ClockMonitor
 from cpcbl_agents.collaboration import MessageCounters
 from cpcbl_agents.declarations import Declarations, LivelinessTokens
-from cpcbl_agents.inbox import INBOX, Inbox
 from cpcbl_agents.input_diagnosis.monitor import InputMonitor
 from cpcbl_agents.load import LoadMonitor, MayGoOn, everything
 from cpcbl_agents.pose_output import PoseOutput
-from cpcbl_agents.robot import Robot, build_robot
-from cpcbl_agents.sources import OwnCamera
+from cpcbl_agents.robot import Robot
+from cpcbl_agents.tape import NO_TAPE, Tape
 from cpcbl_team.config import Team
 from cpcbl_team.inputs import Belief, Fix
 from cpcbl_transport import messages, topics
@@ -42,7 +41,6 @@ STATUS_NS = 1_000_000_000
 ASK_NS = 500_000_000  # how often a guest asks the simulated field to simulate it
 RETRY_NS = 50_000_000  # while no field subscribes
 WARN_AFTER_NS = 3_000_000_000  # without any input
-ON_ARRIVAL = ("frame_skipped", "inbox_overflow", "news_overflow", "same_name_twice")
 
 
 class Steppable(Protocol):
@@ -95,70 +93,42 @@ class Node:
         bus: Bus,
         start: NodeStart,
         callbacks: NodeCallbacks = NO_CALLBACKS,
+        tape: Tape = NO_TAPE,
     ) -> None:
+        """`tape`: what notes or plays all that passes between the node and the world."""
         start_ns, incarnation, speed = start
         self.robot, self._incarnation, self._name = robot, incarnation, robot.name
-        self._callbacks, self._status_ns = callbacks, start_ns
-        self._frame_key = topics.IN_FRAME.at(robot=robot.name)
+        self._callbacks, self._status_ns, self._tape = callbacks, start_ns, tape
         rules = team.robots[robot.name].collaboration
         self._team, self._passive = frozenset(team.robots), rules.passive
-        self._inbox, self._load = Inbox(self._team), LoadMonitor(speed)
-        self._frames: deque[tuple[str, bytes]] = deque(maxlen=1)
-        self._liveliness_events: deque[tuple[str, bool]] = deque(maxlen=INBOX)
+        tape.begin(start_ns)
+        self._bus = bus = tape.wrap_bus(bus)
+        named = robot.name, incarnation, self._team
+        self.arrivals, self._load = tape.arrivals(*named, callbacks.on_arrival), LoadMonitor(speed)
+        robot.sensing.wrap(tape)
+        put_message, put_token = self.arrivals.put_message, self.arrivals.put_token
         self._declarations = Declarations(
-            robot.name, incarnation, rules, bus, self._on_message, self._on_token
+            robot.name, incarnation, rules, bus, put_message, put_token
         )
         self._pose = PoseOutput(robot, bus, team.robots[robot.name].pose_rate_hz, start_ns)
         self._tokens = LivelinessTokens()
         self._subscribed: dict[object, str] = {BeliefSubscribers: "", FrameSubscribers: ""}
         self._explained: set[tuple[str, Refusal]] = set()
-        # What threads of the bus count has its entry: to add one, another thread must not read
-        self.counts: Counter[str] = Counter(dict.fromkeys(ON_ARRIVAL, 0))
+        self._counts: Counter[str] = Counter()
         self.received = MessageCounters()
         self._clocks = ClockMonitor(rules.trust, speed) if rules.trust.enabled else None
         self._health = InputMonitor(robot.name, team, start_ns, speed)
         self._note_confirmation()
-        self._namesakes: set[str] = set()  # tokens of other processes with this robot's name
-        self._inputs = [
-            bus.subscribe(topic.at(robot=robot.name), self._on_message) for topic in topics.INPUTS
-        ]
-        self._own_name = bus.watch_liveliness(topics.ALIVE.at(robot=robot.name), self._on_own_name)
+        for topic in topics.INPUTS:
+            bus.subscribe(topic.at(robot=robot.name), put_message)
+        own_tokens = topics.ALIVE.at(robot=robot.name)
+        bus.watch_liveliness(own_tokens, self.arrivals.put_own_name)
+        tape.end()
 
     @property
     def has_moved(self) -> bool:
         """Whether the robot is no longer where it started, by its odometry."""
         return self._health.has_moved
-
-    # On a thread of the bus ---------------------------------------------------------------------
-
-    def _on_message(self, key: str, payload: bytes) -> None:
-        if key == self._frame_key:  # only the latest: a robot that is slow sees less, not late
-            if self._frames:
-                self.counts["frame_skipped"] += 1
-            self._frames.append((key, payload))
-        else:
-            # Enough to refuse it: it may be a large frame
-            dropped = self._inbox.put(key, payload[: messages.LARGEST_PAYLOAD + 1])
-            if dropped:
-                self.counts["inbox_overflow"] += dropped
-        self._callbacks.on_arrival()
-
-    def _on_token(self, key: str, alive: bool) -> None:
-        if len(self._liveliness_events) == INBOX:
-            self.counts["news_overflow"] += 1
-        self._liveliness_events.append((key, alive))
-        self._callbacks.on_arrival()
-
-    def _on_own_name(self, key: str, alive: bool) -> None:
-        if key.endswith("/" + self._incarnation):
-            return
-        if alive:
-            self.counts["same_name_twice"] += 1
-            self._namesakes.add(key)
-        else:
-            self._namesakes.discard(key)
-
-    # On one thread at a time --------------------------------------------------------------------
 
     @property
     def next_ns(self) -> int:
@@ -166,17 +136,27 @@ class Node:
 
     @property
     def waiting(self) -> bool:
-        return bool(self._inbox or self._liveliness_events or self._frames)
+        return self.arrivals.any_wait
+
+    @property
+    def counts(self) -> Counter[str]:
+        """What this node refused, and what happened as things arrived."""
+        return self.arrivals.counts + self._counts
 
     def step(self, now_ns: int, may_go_on: MayGoOn = everything) -> None:
         """Handles what has arrived, lets the robot work, and publishes the results. What arrives
         meanwhile waits for the next step, and so does what this one may not handle any more: a
         flood must not keep it from ending."""
+        self._tape.begin(now_ns)
+        self._step(now_ns, may_go_on)
+        self._tape.end()
+
+    def _step(self, now_ns: int, may_go_on: MayGoOn) -> None:
         due_ns = self.robot.next_ns
-        self._handle_arrivals(now_ns, may_go_on)
-        self._load.note(due_ns, now_ns, self._inbox.is_fair)
-        if self._frames:
-            self._handle_payload(*self._frames.popleft(), now_ns)
+        is_behind = self._handle_arrivals(now_ns, may_go_on)
+        self._load.note(due_ns, now_ns, is_behind)
+        if (frame := self.arrivals.take_frame()) is not None:
+            self._handle_payload(*frame, now_ns)
         if self._passive and self._declarations.tier is not None:
             self._check_subscribers(topics.BELIEF, BeliefSubscribers, now_ns)
         if self.robot.sensing.has_detector:
@@ -193,22 +173,24 @@ class Node:
             self._status_ns = now_ns
             self._publish_status(now_ns)
 
-    def _handle_arrivals(self, now_ns: int, may_go_on: MayGoOn) -> None:
-        """Handles tokens, then messages; at least one of each that waits."""
-        handled, tokens, waiting = 0, len(self._liveliness_events), len(self._inbox)
+    def _handle_arrivals(self, now_ns: int, may_go_on: MayGoOn) -> bool:
+        """Handles tokens, then messages; at least one of each that waits. Whether messages are
+        left that had waited."""
+        arrivals, handled, taken = self.arrivals, 0, 0
+        tokens, waiting = arrivals.waiting_tokens, arrivals.waiting_messages
         while handled < tokens and (not handled or may_go_on(handled)):
-            self._handle_token(*self._liveliness_events.popleft(), now_ns)
+            self._handle_token(*arrivals.take_token(), now_ns)
             handled += 1
-        taken = 0
         while taken < waiting and (not taken or may_go_on(handled + taken)):
-            self._handle_payload(*self._inbox.take(), now_ns)
+            self._handle_payload(*arrivals.take_message(), now_ns)
             taken += 1
-        self._inbox.is_fair = taken < waiting
+        arrivals.note_taken(taken, waiting)
+        return taken < waiting
 
     def _handle_payload(self, key: str, payload: bytes, now_ns: int) -> None:
         message, source = self._decode(key, payload, now_ns), self._health.by_key.get(key)
         if isinstance(message, Refusal):
-            self.counts[message] += 1
+            self._counts[message] += 1
             self._explain(key, payload, message)
             if source is not None:
                 source.refuse(message, payload, now_ns)
@@ -254,7 +236,7 @@ class Node:
         """Tells the robot which teammates are present, and with which tier."""
         presence = self._tokens.update(key, alive)
         if presence is None:
-            self.counts["bad_token"] += 1
+            self._counts["bad_token"] += 1
             return
         name, tier = presence
         was_guest = self.robot.is_guest(name)
@@ -294,12 +276,12 @@ class Node:
         received = self.received.flows()
         status = self.robot.status(now_ns, self._incarnation, counts, received, self._clocks)
         snapshot = self.robot.input_snapshot()
-        inputs, problems = self._health.judge(snapshot, now_ns, bool(self._namesakes))
+        inputs, problems = self._health.judge(snapshot, now_ns, self.arrivals.has_namesake)
         is_contradicted = bool(snapshot.mistake) and self._health.is_mistake_contradicted
         if self._health.are_mended or is_contradicted:
             self.robot.forget_wrong_inputs(now_ns)
-        overload = self._load.judge(len(self._inbox), self._inbox.pop_dropped())
-        problems = (*overload, *problems, *self.robot.sensing.problems)
+        overload = self._load.judge(*self.arrivals.pop_overflow())
+        problems = (*overload, *problems, *self.robot.sensing.problems, *self._tape.problems)
         self._note_confirmation()
         status = msgspec.structs.replace(
             status,
@@ -326,19 +308,18 @@ class GuestNode(Node):
 
     def __init__(
         self,
-        name: str,
+        robot: Robot,
         team: Team,
         bus: Bus,
         start: NodeStart,
-        camera: OwnCamera | None = None,
         callbacks: NodeCallbacks = NO_CALLBACKS,
+        tape: Tape = NO_TAPE,
     ) -> None:
-        robot = build_robot(name, team, start.stamp_ns, camera=camera)
-        super().__init__(robot, team, bus, start, callbacks)
+        super().__init__(robot, team, bus, start, callbacks, tape)
         self._ask_ns = start.stamp_ns
         self._warn_ns: int | None = start.stamp_ns + WARN_AFTER_NS
-        self._model = messages.model_from_settings(team.robots[name])
-        self._join = bus.publisher(topics.JOIN.at(robot=name), topics.JOIN.qos)
+        self._model = messages.model_from_settings(team.robots[robot.name])
+        self._join = self._bus.publisher(topics.JOIN.at(robot=robot.name), topics.JOIN.qos)
 
     @property
     def next_ns(self) -> int:
@@ -357,7 +338,7 @@ class GuestNode(Node):
             " and does its file let guests in?"
         )
 
-    def step(self, now_ns: int, may_go_on: MayGoOn = everything) -> None:
+    def _step(self, now_ns: int, may_go_on: MayGoOn) -> None:
         """Asks the field when that is due, and steps the node."""
         if self._warn_ns is not None and now_ns >= self._warn_ns:
             self._warn_ns = None
@@ -365,12 +346,14 @@ class GuestNode(Node):
                 log.warning("%s %s", self.robot.name, self.missing_input)
         if self._model is not None and now_ns >= self._ask_ns:
             self._ask_ns = now_ns + (ASK_NS if self._ask(now_ns, self._model) else RETRY_NS)
-        super().step(now_ns, may_go_on)
+        super()._step(now_ns, may_go_on)
 
     def leave(self, now_ns: int) -> None:
         """Tells the field that the guest leaves. All else ends with the session."""
+        self._tape.begin(now_ns, leaves=True)
         if self._model is not None:
             self._ask(now_ns, None)
+        self._tape.end()
 
     def _ask(self, now_ns: int, model: messages.SimulatedRobotModel | None) -> bool:
         """Asks the field; whether a field subscribes."""

@@ -6,6 +6,7 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, closing, nullcontext, suppress
+from pathlib import Path
 
 import msgspec
 
@@ -16,6 +17,7 @@ from cpcbl_agents.robot import Robot, build_robot
 from cpcbl_agents.robot_log import RobotLogger
 from cpcbl_agents.sources import OwnCamera
 from cpcbl_agents.stop import StopSignal as StopSignal  # with a robot, one needs it
+from cpcbl_agents.tape import NO_TAPE, Tape
 from cpcbl_agents.watchdog import with_watchdog
 from cpcbl_team.config import Team
 from cpcbl_team.errors import ClockError
@@ -106,11 +108,13 @@ def run_robot(
     stop: Callable[[], bool],
     restarted: bool | None = None,
     wrap_bus: Callable[[Bus], Bus] = lambda bus: bus,
+    record: Path | None = None,
 ) -> None:
     """Runs a robot until `stop()`. One that is started again does not know where it is, once it has
     moved. `restarted` says whether that is so; None: the router knows.
 
-    `wrap_bus` may put something between the robot and its bus. Raises BusError when stopped before
+    `wrap_bus` may put something between the robot and its bus; `record` is the folder that it
+    records into. Raises BusError when stopped before
     a router answered, LogError for an unreadable log, SecurityError without the keys of a secured
     team, InputError for a camera that cannot be used or when another process is this robot,
     DependencyError without OpenCV, ClockError when this machine's clock was set.
@@ -138,9 +142,12 @@ def run_robot(
                 tokens.declare_moved()
 
         callbacks = NodeCallbacks(loop.on_arrival, on_status)
-        node = Node(robot, team, wrap_bus(bus), start, callbacks)
-        logger.log_connected(team, link.endpoints)
-        with robot.sensing.detect_on_thread(loop.wake):
+        with (
+            robot.sensing.detect_on_thread(loop.wake),
+            tape_for(robot, team, start, record) as tape,
+        ):
+            node = Node(robot, team, wrap_bus(bus), start, callbacks, tape)
+            logger.log_connected(team, link.endpoints)
             loop.run(node, with_watchdog(stop_on_clock_step(name, team, clock, stop)))
 
 
@@ -169,6 +176,19 @@ def make_robot(
         robot = msgspec.structs.replace(team.robots[name], start=None)
         team = msgspec.structs.replace(team, robots={**team.robots, name: robot})
     return build_robot(name, team, start_ns, late or before.moved or before.ran, camera)
+
+
+def tape_for(
+    robot: Robot, team: Team, start: NodeStart, record: Path | None, is_guest: bool = False
+) -> AbstractContextManager[Tape]:
+    """What the robot's node records with: into this folder, or that of the team file. Raises
+    InputError for a folder that cannot be written to."""
+    folder = record or team.recording.folder
+    if not folder:
+        return nullcontext(NO_TAPE)
+    from cpcbl_agents.flight_recorder import recorded  # no other robot needs it
+
+    return recorded(Path(folder), robot, team, start, is_guest)
 
 
 def new_incarnation() -> str:

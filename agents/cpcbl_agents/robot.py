@@ -48,6 +48,14 @@ class InputSnapshot(NamedTuple):
     initial_pose: InitialPose | None = None  # the newest that somebody has set
 
 
+class RobotStart(NamedTuple):
+    """When and how a robot started: with its team's settings, what it depends on."""
+
+    stamp_ns: int
+    is_pose_given: bool  # by `start` in its settings, which it does not take where it has moved
+    restarted: bool  # it ran before, and may have spent its budget
+
+
 class Robot:
     """The agents of one robot of a team; `build_robot` makes one from a team file."""
 
@@ -56,6 +64,7 @@ class Robot:
     ) -> None:
         settings, teammates = team.robots[name], frozenset(team.robots) - {name}
         self.name, self.sensing, self._shared_ns = name, sensing, start_ns
+        self.start = RobotStart(start_ns, team.robots[name].start is not None, restarted)
         camera = settings.camera if settings.sensing == "camera" else None
         self.filter = FilterAgent(settings, team.map, teammates, start_ns, camera)
         self._is_weighted = settings.localizer.variant == "weighted"  # it has no covariance

@@ -8,7 +8,12 @@ from typing import TYPE_CHECKING
 import msgspec
 
 from cpcbl_agents.agent import AgentMessage, FrameSubscribers, PoseEstimate, Tick
-from cpcbl_agents.detection_worker import DetectedFrame, DetectionWorker, detect
+from cpcbl_agents.detection_worker import (
+    DetectedFrame,
+    Detection,
+    DetectionWorker,
+    ImmediateDetection,
+)
 from cpcbl_agents.sources import OwnCamera, Picture, Source
 from cpcbl_agents.waypoint_follower import WaypointFollower
 from cpcbl_team.config import LocalizationSettings
@@ -17,6 +22,7 @@ from cpcbl_team.sensors import corrected_odometry, corrected_sighting, without_d
 from cpcbl_transport.messages import Frame, SensorInput, input_name
 
 if TYPE_CHECKING:  # it needs OpenCV
+    from cpcbl_agents.tape import Tape
     from cpcbl_agents.vision.camera_correction import CameraCorrection
     from cpcbl_agents.vision.detector import CameraDetector
 
@@ -50,8 +56,10 @@ class SensingAgent:
         self._sources = [s for s in (source, camera) if s is not None]
         self._follower, self._detector, self._has_subscribers = follower, detector, False
         self._correction = correction
-        self._worker: DetectionWorker | None = None
-        self._held: list[Odometry] = []  # that came while the worker had a frame
+        self._detection: Detection | None = None
+        if detector is not None:
+            self._detection = ImmediateDetection(detector)
+        self._held: list[Odometry] = []  # that came while the detector had a frame
         self._annotated_ns = -ANNOTATION_INTERVAL_NS
         self._counts: Counter[str] = Counter()
         self.refused: Counter[str] = Counter()
@@ -60,28 +68,42 @@ class SensingAgent:
     @contextmanager
     def detect_on_thread(self, wake: Callable[[], None]) -> Iterator[None]:
         """Until the end, the detector works on a thread of its own, which calls `wake` for each of
-        its results: a tick then takes them."""
+        its results: a tick then takes them. To be called before a node wraps the detection."""
         if self._detector is None:
             yield
             return
-        with closing(DetectionWorker(self._detector, wake)) as self._worker:
+        with closing(DetectionWorker(self._detector, wake)) as self._detection:
             yield
+
+    def wrap(self, tape: "Tape") -> None:
+        """From now on what is polled and detected passes this tape."""
+        if self._source is not None:
+            self._source = tape.wrap_source("source", self._source)
+        if self._camera is not None:
+            self._camera = tape.wrap_source("camera", self._camera)
+        self._sources = [s for s in (self._source, self._camera) if s is not None]
+        if self._detection is not None:
+            self._detection = tape.wrap_detection(self._detection)
 
     @property
     def counts(self) -> Counter[str]:
         """What was sensed, and what could not be used, by reason."""
-        parts = (self._camera, self._worker or self._detector, self._correction)
+        parts = (self._camera, self._detection, self._correction)
         return sum((part.counts for part in parts if part is not None), self._counts)
 
     @property
     def has_detector(self) -> bool:
-        return self._detector is not None
+        return self._detection is not None
+
+    @property
+    def has_own_camera(self) -> bool:
+        """Whether it reads a camera itself, beside what a driver sends."""
+        return self._camera is not None
 
     @property
     def problems(self) -> tuple[str, ...]:
         """What the robot doubts about its camera, as sentences."""
-        detector = self._worker or self._detector
-        parts = (p for p in (detector, self._correction) if p is not None)
+        parts = (p for p in (self._detection, self._correction) if p is not None)
         return tuple(problem for part in parts for problem in part.problems)
 
     @property
@@ -97,8 +119,7 @@ class SensingAgent:
             case Tick():
                 items = [item for source in self._sources for item in source.poll(now_ns)]
                 outgoing = [out for item in items for out in self._process(item)]
-                results = self._worker.collect() if self._worker is not None else ()
-                return [*outgoing, *(out for found in results for out in self._take(found))]
+                return [*outgoing, *self._collect()]
             case Odometry() | Sightings() | Position() | InitialPose() | Frame():
                 return self._process(message)
             case FrameSubscribers():
@@ -113,7 +134,7 @@ class SensingAgent:
     def _process(self, item: SensorInput | Picture) -> Sequence[AgentMessage]:
         if not isinstance(item, Frame | Picture):
             return [self._correct(item)]
-        if self._detector is None:
+        if self._detection is None:
             self._refuse("no_camera")
             return ()
         self._counts["frame"] += 1
@@ -121,11 +142,15 @@ class SensingAgent:
         annotates = self._has_subscribers and not is_recent
         if annotates:
             self._annotated_ns = item.stamp_ns
-        if self._worker is None:
-            return self._take(detect(self._detector, item, annotates))
-        if self._worker.submit(item, annotates):
+        if self._detection.submit(item, annotates):
             self._counts["frame_skipped"] += 1
-        return ()
+        return self._collect()
+
+    def _collect(self) -> list[AgentMessage]:
+        """What follows from the frames that the detector has looked at by now."""
+        if self._detection is None:
+            return []
+        return [out for found in self._detection.collect() for out in self._take(found)]
 
     def _take(self, found: DetectedFrame) -> Sequence[AgentMessage]:
         """What follows from a frame that the detector has looked at."""
@@ -145,7 +170,7 @@ class SensingAgent:
         measured."""
         if self._correction is None:
             return
-        if self._worker is not None and self._worker.is_busy:
+        if self._detection is not None and self._detection.is_busy:
             self._held.append(piece)
             return
         self._release_odometry(piece.stamp_ns)

@@ -29,6 +29,7 @@ from cpcbl_team.config.field import Wall as Wall
 from cpcbl_team.config.localizer import LocalizerSettings as LocalizerSettings
 from cpcbl_team.config.localizer import Variant as Variant
 from cpcbl_team.config.localizer import Weights as Weights
+from cpcbl_team.config.recording import RecordingSettings as RecordingSettings
 from cpcbl_team.config.ros2 import Datum as Datum
 from cpcbl_team.config.ros2 import Distribution as Distribution
 from cpcbl_team.config.ros2 import Ros2RobotSettings as Ros2RobotSettings

@@ -8,6 +8,7 @@ from cpcbl_team.config.camera import CameraSettings, Side, VisionSettings
 from cpcbl_team.config.collaboration import CollaborationSettings
 from cpcbl_team.config.field import Bands, Field, SimulationSettings
 from cpcbl_team.config.localizer import LocalizerSettings
+from cpcbl_team.config.recording import RecordingSettings
 from cpcbl_team.config.ros2 import Ros2RobotSettings, Ros2Settings
 from cpcbl_team.config.sensors import OdometrySettings, PositionSensor, SensorSettings
 from cpcbl_team.config.table import NotNegative, Positive, Table
@@ -157,6 +158,7 @@ class Team(Table, frozen=True, kw_only=True):
     """With this table `up` also starts the gateway."""
     ros2: Ros2Settings | None = None
     """With this table `up` and `robot` also start the bridge to ROS 2."""
+    recording: RecordingSettings = RecordingSettings()
     match: MatchSettings = MatchSettings()
     simulation: SimulationSettings = SimulationSettings()
     guests: GuestSettings = GuestSettings()

@@ -155,8 +155,8 @@ def test_a_step_is_repeated_exactly_by_the_number_of_messages_that_it_took() -> 
                 odd = saw(now_ns - number * MS, Sighting("oak", 4.0, 0.01))
                 on.stand.sightings("me", odd)
             on.stand.odometry("me", standing(now_ns, now_ns - 100 * MS))
-            before = len(on.node._inbox)
+            before = on.node.arrivals.waiting_messages
             on.node.step(now_ns, may_go_on or first(numbers[-1]))
-            numbers.append(before - len(on.node._inbox))
+            numbers.append(before - on.node.arrivals.waiting_messages)
     assert live.tracks.payloads == again.tracks.payloads
     assert live.stand.now_ns == NOW + 12 * 100 * MS

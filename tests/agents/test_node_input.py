@@ -354,7 +354,7 @@ def test_a_step_ends_although_more_and_more_arrives(monkeypatch: pytest.MonkeyPa
 def test_what_threads_of_the_bus_count_is_read_while_they_count() -> None:
     """No entry is added under the reader, and what never happened is not reported."""
     stand = only_me()
-    counts = stand.nodes["me"].counts
+    counts = stand.nodes["me"].arrivals.counts
     entries = set(counts)
     for _ in range(INBOX + 1):
         stand.put(IN_FRAME, b"")

@@ -8,7 +8,7 @@ from typing import NamedTuple
 from msgspec.structs import replace
 
 from cpcbl_agents.node import GuestNode, NodeStart, Steppable
-from cpcbl_agents.robot import NEVER_NS
+from cpcbl_agents.robot import NEVER_NS, build_robot
 from cpcbl_launch.reporting.recorder import Recorder, Report
 from cpcbl_launch.reporting.recording import Recording
 from cpcbl_launch.simulation.field import SimulatedField
@@ -56,7 +56,8 @@ class ScheduledGuestNode:
     def step(self, now_ns: int) -> None:
         if self._bus is None:
             self._bus = self._hub.session()
-            self._visit = GuestNode(self._name, self._team, self._bus, NodeStart(now_ns, "1"))
+            robot = build_robot(self._name, self._team, now_ns)
+            self._visit = GuestNode(robot, self._team, self._bus, NodeStart(now_ns, "1"))
         if self._visit is None:
             return
         if now_ns < self._until_ns:

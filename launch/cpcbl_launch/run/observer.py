@@ -12,7 +12,14 @@ import msgspec
 
 from cpcbl_agents.clock import Clock
 from cpcbl_agents.node import GuestNode, NodeCallbacks, NodeStart
-from cpcbl_agents.process import Loop, new_incarnation, own_camera, stop_on_clock_step
+from cpcbl_agents.process import (
+    Loop,
+    new_incarnation,
+    own_camera,
+    stop_on_clock_step,
+    tape_for,
+)
+from cpcbl_agents.robot import build_robot
 from cpcbl_agents.robot_log import RobotLogger
 from cpcbl_launch.reporting.statuses import FlowReport, ProblemLog, ProblemReport, summed_flows
 from cpcbl_launch.simulation.guests import unsupported_delay
@@ -149,8 +156,10 @@ def run_observer(
     clock: Clock,
     stop: Callable[[], bool],
     duration_s: float = math.inf,
+    record: Path | None = None,
 ) -> ObserverReport:
     """Runs an observer that `team` holds until `stop()`, or for so many seconds of robot time.
+    `record` is the folder that it records into.
 
     Raises BusError when stopped before a router answered, InputError for a name that is taken, or
     when this machine's clock was set, SecurityError without the keys of a secured team.
@@ -170,24 +179,33 @@ def run_observer(
             problems.add(status)
 
         callbacks = NodeCallbacks(loop.on_arrival, on_status)
-        node = GuestNode(name, team, bus, start, camera, callbacks)
-        logger.log_connected(team, link.endpoints)
-        over = stop_on_clock_step(name, team, clock, stop)
-        loop.run(node, lambda: over() or clock.now_ns() - start.stamp_ns >= duration_s * 1e9)
-        end_ns = clock.now_ns()
-        node.leave(end_ns)
+        robot = build_robot(name, team, start.stamp_ns, camera=camera)
+        with tape_for(robot, team, start, record, is_guest=True) as tape:
+            node = GuestNode(robot, team, bus, start, callbacks, tape)
+            logger.log_connected(team, link.endpoints)
+            over = stop_on_clock_step(name, team, clock, stop)
+            loop.run(node, lambda: over() or clock.now_ns() - start.stamp_ns >= duration_s * 1e9)
+            end_ns = clock.now_ns()
+            node.leave(end_ns)
+    seconds = (end_ns - start.stamp_ns) * 1e-9
+    return _report(node, team.name, seconds, problems.reports)
+
+
+def _report(
+    node: GuestNode, team: str, seconds: float, problems: tuple[ProblemReport, ...]
+) -> ObserverReport:
     latest = node.robot.collaboration.latest
     return ObserverReport(
-        name=name,
-        team=team.name,
-        seconds=(end_ns - start.stamp_ns) * 1e-9,
+        name=node.robot.name,
+        team=team,
+        seconds=seconds,
         position_sigma_m=None if latest is None else latest.estimate.position_sigma_m,
         lost="" if latest is None else latest.lost,
         unfed=node.missing_input,
         sent=summed_flows([node.robot.collaboration.counters.flows()]),
         heard=summed_flows([node.received.flows()]),
         counts=dict(node.robot.counts + node.counts),
-        problems=problems.reports,
+        problems=problems,
     )
 
 

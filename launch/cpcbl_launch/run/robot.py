@@ -46,6 +46,12 @@ def robot_parser(program: str = "cpcbl-team robot") -> argparse.ArgumentParser:
         help="Whether it has moved since the team started, and has to find its pose; default: what"
         " the team's router remembers.",
     )
+    add(
+        "--record",
+        type=Path,
+        metavar="FOLDER",
+        help="Folder to record into what it takes and sends; default: the file's, else none.",
+    )
     add("--clock", default="", help=argparse.SUPPRESS)
     add("--parent", type=int, help=argparse.SUPPRESS)
     return parser
@@ -78,6 +84,7 @@ def run_robot_command(
             stop,
             arguments.restarted,
             lambda bus: wrap_bus(arguments.name, clock, bus),
+            arguments.record,
         )
 
 

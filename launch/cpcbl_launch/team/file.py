@@ -72,6 +72,9 @@ def load_team(path: Path) -> Team:
     if team.gateway is not None:
         tokens = str((path.parent / team.gateway.tokens).absolute())
         team = replace(team, gateway=replace(team.gateway, tokens=tokens))
+    if team.recording.folder:
+        folder = str((path.parent / team.recording.folder).absolute())
+        team = replace(team, recording=replace(team.recording, folder=folder))
     if team.ros2 is not None and team.ros2.keys:
         keys = str((path.parent / team.ros2.keys).absolute())
         team = replace(team, ros2=replace(team.ros2, keys=keys))

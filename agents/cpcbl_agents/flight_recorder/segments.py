@@ -1,0 +1,123 @@
+"""Writes the steps of a node into files, on a thread of its own: a slow disk delays no step.
+
+What is over is written twice a second and reaches the disk (fsync) once a second. Whatever goes
+wrong ends the recording, never the robot.
+"""
+
+import os
+import threading
+import time
+from collections import deque
+from contextlib import suppress
+from pathlib import Path
+from typing import BinaryIO
+
+from msgspec.structs import replace
+
+from cpcbl_agents.flight_recorder.entries import Header, Step, header_block, steps_block
+from cpcbl_team.config import RecordingSettings
+
+WRITE_S, SYNC_S = 0.5, 1.0
+LARGEST_BACKLOG = 32 * 1024 * 1024  # bytes that wait for the disk
+PATIENCE_S = 1.8  # for the thread at the end
+SUFFIX = ".cpcbl"
+
+
+class SegmentWriter:
+    """Writes `FOLDER/<robot>/<incarnation>-NNNN.cpcbl`, a new file when one is large or old, and
+    deletes the oldest of the robot's where all are to take a limited size. Raises OSError where the
+    first file cannot be begun; later `problem` says why nothing is recorded any more."""
+
+    def __init__(self, folder: Path, header: Header, rules: RecordingSettings) -> None:
+        self._folder, self._header, self._rules = folder / header.robot, header, rules
+        self.problem = ""
+        self._steps: deque[tuple[Step, int]] = deque()
+        self._added = self._written = 0  # bytes in memory; each is changed by one thread
+        self._begun_s = self._synced_s = time.monotonic()
+        self._is_synced = False
+        self._stop = threading.Event()
+        self._folder.mkdir(parents=True, exist_ok=True)
+        self._file = self._begin_file()
+        self._thread = threading.Thread(target=self._run, name="flight-recorder", daemon=True)
+        self._thread.start()
+
+    def add(self, step: Step, size: int) -> None:
+        """One more step, which takes about so many bytes in memory."""
+        if self.problem:
+            return
+        if self._added + size - self._written > LARGEST_BACKLOG:
+            self._give_up("the disk is too slow")
+            return
+        self._added += size
+        self._steps.append((step, size))
+
+    def close(self) -> None:
+        """Writes what is left."""
+        self._stop.set()
+        self._thread.join(PATIENCE_S)
+
+    def _give_up(self, reason: str) -> None:
+        self.problem = f"no longer recorded: {reason} ({self._folder})"
+        self._steps.clear()
+
+    # On the thread ------------------------------------------------------------------------------
+
+    def _run(self) -> None:
+        try:
+            while not self.problem:
+                is_last = self._stop.wait(WRITE_S)
+                self._write()
+                if is_last:
+                    break
+        except OSError as error:
+            self._give_up(error.strerror or str(error))
+        finally:
+            if not self.problem and not self._stop.is_set():
+                self._give_up("an error of this program")
+            with suppress(OSError):  # what is left in the buffer finds no room either
+                self._file.close()
+
+    def _write(self) -> None:
+        taken = [self._steps.popleft() for _ in range(len(self._steps))]
+        now_s = time.monotonic()
+        if taken:
+            self._file.write(steps_block([step for step, _ in taken]))
+            self._file.flush()
+            self._written += sum(size for _, size in taken)
+            self._is_synced = False
+        if not self._is_synced and (self._stop.is_set() or now_s - self._synced_s >= SYNC_S):
+            os.fsync(self._file.fileno())
+            self._synced_s, self._is_synced = now_s, True
+        is_large = self._file.tell() >= self._rules.segment_bytes
+        if is_large or now_s - self._begun_s >= self._rules.segment_s:
+            self._file.close()
+            self._header = replace(self._header, segment=self._header.segment + 1)
+            self._file = self._begin_file()
+            self._delete_oldest()
+
+    def _begin_file(self) -> BinaryIO:
+        name = f"{self._header.incarnation}-{self._header.segment:04}{SUFFIX}"
+        file = (self._folder / name).open("xb")
+        self._begun_s = self._synced_s = time.monotonic()
+        file.write(header_block(replace(self._header, began_unix_s=time.time())))
+        file.flush()
+        self._is_synced = False
+        folder = os.open(self._folder, os.O_RDONLY)
+        try:
+            os.fsync(folder)  # the file's name
+        finally:
+            os.close(folder)
+        return file
+
+    def _delete_oldest(self) -> None:
+        """Keeps the files of this robot within the size that they may take together."""
+        if not self._rules.keep_bytes:
+            return
+        files = sorted((path.stat().st_mtime_ns, path) for path in self._folder.glob(f"*{SUFFIX}"))
+        sizes = [path.stat().st_size for _, path in files]
+        total = sum(sizes)
+        for (_, path), size in zip(files[:-1], sizes, strict=False):
+            if total <= self._rules.keep_bytes:
+                return
+            path.unlink()
+            total -= size
