@@ -31,7 +31,7 @@ from google.protobuf.duration_pb2 import Duration
 from google.protobuf.message import Message as Protobuf
 from google.protobuf.timestamp_pb2 import Timestamp
 
-from cpcbl_agents.robot_state import Severity, robot_state
+from cpcbl_launch.reporting.events import Event, EventLog
 from cpcbl_launch.reporting.metrics import ellipse_of
 from cpcbl_launch.reporting.recorded_file import CAMERAS
 from cpcbl_launch.reporting.statuses import current_help
@@ -60,10 +60,8 @@ class _Robot:
     def __init__(self, colour: str) -> None:
         self.colour = colour
         self.track: Track | None = None
-        self.status: Status | None = None
         self.trail: deque[Point3] = deque(maxlen=TRAIL_LENGTH)
         self.scene_ns = self.trail_ns = -SCENE_NS
-        self.words = ""
 
 
 class FoxgloveRun:
@@ -72,6 +70,7 @@ class FoxgloveRun:
     def __init__(self, team: Team) -> None:
         self._team = team
         self._robots: dict[str, _Robot] = {}
+        self._events = EventLog()
         self._truth_ns = -TRUTH_NS
         for name in sorted(team.robots):
             self._robot(name)
@@ -102,6 +101,7 @@ class FoxgloveRun:
 
     def shown(self, at_ns: int, message: Message) -> Iterator[Shown]:
         """What is to be shown of a message."""
+        yield from map(_log, self._events.events(at_ns, message))
         match message:
             case Track():
                 yield from self._of_track(at_ns, message)
@@ -145,15 +145,8 @@ class FoxgloveRun:
             trail = _line(list(robot.trail), 0.03, robot.colour, 0.6)
             entity = SceneEntity(timestamp=stamp, frame_id=FIELD, id="trail", lines=[trail])
             yield Shown(f"{at}/trail", SceneUpdate(entities=[entity]))
-        yield from self._changes(at_ns, track.robot, robot)
 
     def _of_status(self, at_ns: int, status: Status) -> Iterator[Shown]:
-        robot = self._robot(status.robot)
-        before, robot.status = robot.status, status
-        if before is None or before.incarnation != status.incarnation:
-            words = f"process {status.incarnation} runs"
-            yield _log(at_ns, status.robot, words, "good" if before is None else "warning")
-        yield from self._changes(at_ns, status.robot, robot)
         arrows = [
             arrow
             for helper, helped, topic in current_help(status)
@@ -161,14 +154,6 @@ class FoxgloveRun:
         ]
         if arrows:
             yield Shown("/help", SceneUpdate(entities=arrows))
-
-    def _changes(self, at_ns: int, name: str, robot: _Robot) -> Iterator[Shown]:
-        """A line of the log where the state of a robot, or its first reason, is another one."""
-        found = robot_state(robot.status, robot.track)
-        words = f"{found.word}: {found.why}" if found.why else found.word
-        if _without_figures(words) != _without_figures(robot.words):
-            robot.words = words
-            yield _log(at_ns, name, words, found.severity)
 
     def _help_entity(self, at_ns: int, helper: str, helped: str, topic: str) -> SceneEntity | None:
         """A line with a head from a helper to the robot that it helps."""
@@ -230,13 +215,14 @@ def _covariance_6x6(
             yield rows[places[row]][places[column]] if is_planar else 0.0
 
 
-def _log(at_ns: int, robot: str, words: str, severity: Severity) -> Shown:
-    level = LEVELS[severity]
-    return Shown("/log", Log(timestamp=_stamp(at_ns), level=level, message=words, name=robot))
-
-
-def _without_figures(words: str) -> str:
-    return "".join(c for c in words if not c.isdigit())
+def _log(event: Event) -> Shown:
+    line = Log(
+        timestamp=_stamp(event.at_ns),
+        level=LEVELS[event.severity],
+        message=event.words,
+        name=event.robot,
+    )
+    return Shown("/log", line)
 
 
 def _stamp(at_ns: int) -> Timestamp:

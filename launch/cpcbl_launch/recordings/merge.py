@@ -6,9 +6,9 @@ them are Foxglove's (`foxglove`). The team and the version of the program are in
 
 import importlib.metadata
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
-from typing import BinaryIO, NamedTuple
+from typing import BinaryIO
 
 import msgspec
 from google.protobuf.message import Message as Protobuf
@@ -16,16 +16,16 @@ from mcap.writer import Writer
 from mcap_protobuf.schema import register_schema
 
 from cpcbl_launch.recordings.foxglove import FoxgloveRun
-from cpcbl_launch.reporting.recorded_file import ABOUT, Recorded, RecordedFile
+from cpcbl_launch.recordings.gather import gather
+from cpcbl_launch.reporting.recorded_file import ABOUT, Recorded
 from cpcbl_launch.reporting.recording import TEAM
 from cpcbl_team.config import Team
 from cpcbl_transport.decoding import carried_type
 from cpcbl_transport.json_messages import encode_json, object_schema
 from cpcbl_transport.messages import AnnotatedFrame
 
-BUS, MERGED = "bus.mcap", "run.mcap"  # in the folder of a run: what is merged, and what it becomes
+MERGED = "run.mcap"  # in the folder of a run
 CHUNK_BYTES = 1_048_576
-Progress = Callable[[float], None]
 
 
 class MergedRun(msgspec.Struct, frozen=True, kw_only=True):
@@ -40,20 +40,11 @@ class MergedRun(msgspec.Struct, frozen=True, kw_only=True):
     remarks: tuple[str, ...] = ()
 
 
-class _Source(NamedTuple):
-    """What is to be merged."""
-
-    team: Team
-    version: str
-    messages: Iterator[Recorded]
-    remarks: tuple[str, ...]
-
-
 def merge(run: Path, output: Path | None = None) -> MergedRun:
     """Makes one file of the folder of a run, or of a recording. Raises LogError, TeamFileError,
     OSError."""
     target = output or (run / MERGED if run.is_dir() else run.with_name(f"{run.stem}-merged.mcap"))
-    source = _source(run)
+    source = gather(run)
     part = target.with_name(f".{target.name}.{os.getpid()}.part")
     try:
         with part.open("wb") as file:
@@ -65,13 +56,9 @@ def merge(run: Path, output: Path | None = None) -> MergedRun:
         part.replace(target)
     finally:
         part.unlink(missing_ok=True)
-    return msgspec.structs.replace(report, file=str(target), bytes=size, remarks=source.remarks)
-
-
-def _source(run: Path) -> _Source:
-    recording = RecordedFile(run / BUS if run.is_dir() else run)
-    remarks = () if recording.is_whole else (f"{recording.path}: its last seconds are missing",)
-    return _Source(recording.team, recording.version, recording.messages(), remarks)
+    return msgspec.structs.replace(
+        report, file=str(target), bytes=size, remarks=tuple(source.remarks)
+    )
 
 
 class _RunWriter:

@@ -188,7 +188,8 @@ def _image(encoding: str, data: bytes) -> bytes:
 class RecordedRun(NamedTuple):
     """What a recording says: inputs and truth (rows of s, x, y, heading) by robot.
 
-    Of robots with cameras, sightings are those of the frames that were shown: twice a second.
+    Of robots with cameras that wrote nothing themselves, sightings are those of the frames that
+    were shown: twice a second.
     """
 
     team: Team
@@ -200,12 +201,17 @@ def read_recording(path: Path) -> RecordedRun:
     """Inputs and truth, as calibration needs them. Raises LogError, TeamFileError."""
     recording = RecordedFile(path)
     inputs: dict[str, list[SensorInput]] = {}
+    found: dict[str, list[SensorInput]] = {}  # by robots' eyes in the frames that were shown
     truths: list[Truths] = []
     for _, key, message in recording.messages("in/", "look/", topics.TRUTH.key):
         if isinstance(message, Truths):
             truths.append(message)
-        if isinstance(message, AnnotatedFrame):  # what the robot's eyes found in a frame
-            message = Sightings(message.stamp_ns, message.found)
+        if isinstance(message, AnnotatedFrame):
+            sightings = Sightings(message.stamp_ns, message.found)
+            found.setdefault(message.robot, []).append(sightings)
         if isinstance(message, Odometry | Sightings | Position | InitialPose):
             inputs.setdefault(key.split("/")[1], []).append(message)
+    for robot, sightings_of in found.items():  # unless the robot wrote down those of all frames
+        if not any(isinstance(i, Sightings) for i in inputs.get(robot, ())):
+            inputs.setdefault(robot, []).extend(sightings_of)
     return RecordedRun(recording.team, inputs, truth_rows(truths))
