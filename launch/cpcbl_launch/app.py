@@ -30,6 +30,7 @@ COMMANDS = {
     "compose": "preparing.compose",
     "simulate": "measuring.simulate",
     "merge": "recorded.merge",
+    "report": "recorded.report",
     "evaluate": "measuring.evaluate",
     "chaos": "measuring.chaos",
     "list": "diagnosing.list_teams",

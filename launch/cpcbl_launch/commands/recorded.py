@@ -4,9 +4,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from rich.console import Console
-from typer import Argument, Option
+from typer import Argument, Option, echo
 
 from cpcbl_launch.commands import options
+from cpcbl_launch.reporting.files import write_or_reason
+from cpcbl_team.errors import InputError
 
 if TYPE_CHECKING:
     from cpcbl_launch.recordings.merge import MergedRun
@@ -45,3 +47,29 @@ def _print_merged(merged: "MergedRun", console: Console) -> None:
     shown = f"{sum(merged.shown.values())} more for other programs"
     text = f"{what}, {shown}, {merged.bytes / 1e6:.1f} MB"
     console.print(f"written: {merged.file} ({text})", highlight=False, soft_wrap=True)
+
+
+def report(
+    runs: Annotated[
+        list[Path],
+        Argument(metavar="RUN [RUN]", help="A recorded run: a folder or a file; two are compared."),
+    ],
+    output: Annotated[
+        Path, Option("--output", "-o", callback=options.writable_file, help="Page to write (HTML).")
+    ] = Path("report.html"),
+) -> None:
+    """Write a page about a recorded run, or about two side by side; it needs nothing else.
+
+    Paths, errors and 3 σ over time, NEES, traffic, who helped whom, faults, refusals, settings.
+    Without true poses it shows what the robots stated.
+    """
+    from cpcbl_launch.recordings.summary import summarize
+    from cpcbl_launch.views.report.page import report_page
+
+    if len(runs) > 2:
+        raise InputError(f"report {runs[2]}: at most two runs are compared")
+    page = report_page([summarize(run) for run in runs])
+    lost = write_or_reason(output, lambda: output.write_text(page, encoding="utf-8"))
+    if not lost:
+        echo(f"written: {output} ({len(page.encode()) / 1e3:.0f} kB)")
+    options.print_not_written(lost)

@@ -229,7 +229,7 @@ class Recorder:
             return {r: self.counts[r] for r in sorted(Refusal) if self.counts[r]}
 
     def restarts(self) -> dict[str, int]:
-        """How often a robot was started again, by its statuses; those that were not are left out."""
+        """How often a robot was started again, by its statuses; without those that never were."""
         return {name: len(own) - 1 for name, own in self._processes.items() if len(own) > 1}
 
     def latest(self) -> tuple[dict[str, Track], dict[str, Status], dict[str, Truth]]:
