@@ -27,7 +27,7 @@ FIELD_WIDE, MOST_FIELD_HIGH = 560.0, 640.0
 MOST_BINS = 260
 LEAST_M, LARGEST_M = 1e-3, 1e3
 NEES_95 = 0.0506, 7.378  # of 95 % of the samples, of a consistent estimate: chi-squared, 2 degrees
-NEES_AXIS = 1e-2, 1e3
+NEES_AXIS = 1e-2, 3e2
 COLOURS = 7
 MOST_NAMED = 24
 
@@ -79,8 +79,8 @@ def common_scales(runs: Sequence[tuple[RunSummary, Sequence[Drawn]]]) -> Scales:
     if not len(every):
         return Scales(1e-2, 1.0, duration_s)
     low, high = np.percentile(every, 2.0), every.max()
-    low_m, high_m = 10.0 ** math.floor(math.log10(low)), 10.0 ** math.ceil(math.log10(high))
-    return Scales(low_m, max(high_m, 10.0 * low_m), duration_s)
+    low_m = 10.0 ** math.floor(math.log10(low))
+    return Scales(low_m, max(1.3 * float(high), 10.0 * low_m), duration_s)
 
 
 # The field ----------------------------------------------------------------------------------------
@@ -132,7 +132,7 @@ def _field_axes(run: RunSummary, robots: Sequence[Drawn]) -> tuple[Axis, Axis, f
     low, high = (
         (points.min(axis=0), points.max(axis=0)) if len(points) else (np.zeros(2), np.ones(2))
     )
-    margin = 0.06 * max(float((high - low).max()), 1.0)
+    margin = 0.1 * max(float((high - low).max()), 1.0)
     low, high = low - margin, high + margin
     span_x, span_y = (float(s) for s in high - low)
     wide, tall = FIELD_WIDE, FIELD_WIDE * span_y / span_x
@@ -193,13 +193,14 @@ def _thinned(truth: Floats) -> Floats:
 # Over time ----------------------------------------------------------------------------------------
 
 
-def over_time(robot: Drawn, scales: Scales) -> str:
-    """The error beside 3 sigma (without truth: sigma), when it was lost or silent, and NEES."""
+def over_time(robot: Drawn, scales: Scales, own_s: float) -> str:
+    """The error beside 3 sigma (without truth: sigma), when it was lost or silent, and NEES;
+    `own_s`: the length of its run."""
     path, duration_s = robot.path, max(scales.duration_s, 1e-3)
     has_nees = bool(len(robot.nees))
     high = HIGH + (NEES_HIGH if has_nees else 0.0)
     x = Axis(0.0, duration_s, LEFT, WIDE - RIGHT)
-    y = Axis(scales.low_m, scales.high_m, HIGH - 20.0, 6.0, is_log=True)
+    y = Axis(scales.low_m, scales.high_m, HIGH - 22.0, 6.0, is_log=True)
     parts = [*_axes(x, y, "m")]
     at_s, three_sigma = binned(path.times_s, 3.0 * path.sigma_m)
     parts.append(
@@ -207,7 +208,7 @@ def over_time(robot: Drawn, scales: Scales) -> str:
             x.at(at_s), np.full(len(at_s), y.start), _level(y, three_sigma), f"sure {robot.colour}"
         )
     )
-    parts += _marked_spans(path, x, y, duration_s)
+    parts += _marked_spans(path, x, y, own_s)
     at_s, values = binned(path.times_s, path.error_or_sigma_m)
     parts.append(line(x.at(at_s), _level(y, values), f"value {robot.colour}"))
     if has_nees:
@@ -224,7 +225,7 @@ def _axes(x: Axis, y: Axis, unit: str) -> Iterator[str]:
     yield text(x.start + 4, 15, unit, "soft")
     for value in x.ticks(6):
         at = float(x.at(np.array(value)))
-        yield text(at, y.start + 15, time_text(value), "soft", "middle")
+        yield text(at, y.start + 17, time_text(value), "soft", "middle")
 
 
 def time_text(seconds: float) -> str:
@@ -277,12 +278,13 @@ def _nees(robot: Drawn, x: Axis, top: float) -> Iterator[str]:
         yield f'<path class="grid" d="M{x.start:.0f} {at:.1f}H{x.end:.0f}"/>'
         yield text(x.start - 5, at + 4, f"{value:g}", "soft", "end")
     yield text(x.start + 4, top + 16, "NEES", "soft")
-    at_s, values = binned(robot.nees_s, robot.nees)
+    at_s, values = binned(robot.nees_s, robot.nees, is_mean=True)
     yield line(x.at(at_s), _level(y, values), f"value {robot.colour}")
 
 
-def binned(times_s: Floats, values: Floats) -> tuple[Floats, Floats]:
-    """The largest value in each of at most `MOST_BINS` spans; NaN where there is none for long."""
+def binned(times_s: Floats, values: Floats, is_mean: bool = False) -> tuple[Floats, Floats]:
+    """The largest value, or the mean, in each of at most `MOST_BINS` spans; NaN where there is none
+    for long."""
     known = np.isfinite(values)
     if not len(times_s):
         return np.empty(0), np.empty(0)
@@ -291,9 +293,13 @@ def binned(times_s: Floats, values: Floats) -> tuple[Floats, Floats]:
     span_s = max(float(times_s[-1] - times_s[0]), 1e-3)
     count = max(1, min(MOST_BINS, int(span_s / (3.0 * usual_s))))
     place = np.clip(((times_s - times_s[0]) / span_s * count).astype(np.int64), 0, count - 1)
+    middle = times_s[0] + (np.arange(count) + 0.5) * span_s / count
+    if is_mean:
+        sums = np.bincount(place[known], values[known], count)
+        numbers = np.bincount(place[known], minlength=count)
+        return middle, np.where(numbers > 0, sums / np.maximum(numbers, 1), np.nan)
     largest = np.full(count, -np.inf)
     np.maximum.at(largest, place[known], values[known])
-    middle = times_s[0] + (np.arange(count) + 0.5) * span_s / count
     return middle, np.where(np.isfinite(largest), largest, np.nan)
 
 
@@ -313,7 +319,7 @@ def help_matrix(helps: Mapping[tuple[str, str], Mapping[str, int]], names: Seque
             if helper == helped or not total:
                 cells.append(f'<td class="{"self" if helper == helped else "none"}"></td>')
                 continue
-            share = 12 + 78 * math.log1p(total) / math.log1p(most)
+            share = 10 + 50 * math.log1p(total) / math.log1p(most)
             title = f"{helper} helped {helped}: " + ", ".join(f"{n} {t}" for t, n in counts.items())
             cells.append(
                 f'<td style="--share:{share:.0f}%" title="{escape(title)}">{short(total)}</td>'

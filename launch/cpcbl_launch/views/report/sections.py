@@ -34,8 +34,8 @@ ROBOTS_ABOUT = (
 )
 TIME_ABOUT = (
     "Line: position error (without truth: σ); area: 3 σ as the robot stated. Red: lost; grey:"
-    " nothing was heard. Below, NEES: in 95 % of its samples a consistent estimate is within the"
-    " green band. Each point is the largest value of its span of time."
+    " nothing was heard. Each point is the largest value of its span of time. Below, NEES (its mean"
+    " over the span): a consistent estimate is within the green band in 95 % of its samples."
 )
 HELP_ABOUT = (
     "Help flows one way, from better to worse tiers: fixes as their senders count them, beliefs as"
@@ -153,7 +153,7 @@ def time_section(shown: Shown) -> str:
         chosen = [robot for robot in heard if robot.path.name in worst]
     cards = [
         f'<div class="card {robot.colour}"><h3><span>{escape(_chart_words(shown, robot))}</span>'
-        f'<b class="dot">{escape(robot.path.name)}</b></h3>{over_time(robot, shown.scales)}</div>'
+        f'<b class="dot">{escape(robot.path.name)}</b></h3>{over_time(robot, shown.scales, shown.run.duration_s)}</div>'
         for robot in chosen
     ]
     if not cards:
