@@ -47,7 +47,7 @@ MARK, LOST = "c5d0da", "ff5d66"
 LEVELS = {"good": Log.INFO, "warning": Log.WARNING, "error": Log.ERROR}
 
 
-class Shown(NamedTuple):
+class FoxgloveMessage(NamedTuple):
     """A message of Foxglove's, and the topic on which it is."""
 
     topic: str
@@ -75,7 +75,7 @@ class FoxgloveRun:
         for name in sorted(team.robots):
             self._robot(name)
 
-    def map(self, at_ns: int) -> Shown:
+    def map(self, at_ns: int) -> FoxgloveMessage:
         """The landmarks and walls, which do not move."""
         stamp, field = _stamp(at_ns), self._team.map
         entities = [
@@ -97,9 +97,9 @@ class FoxgloveRun:
             )
             for name, wall in field.walls.items()
         ]
-        return Shown("/map", SceneUpdate(entities=entities))
+        return FoxgloveMessage("/map", SceneUpdate(entities=entities))
 
-    def shown(self, at_ns: int, message: Message) -> Iterator[Shown]:
+    def messages_for(self, at_ns: int, message: Message) -> Iterator[FoxgloveMessage]:
         """What is to be shown of a message."""
         yield from map(_log, self._events.events(at_ns, message))
         match message:
@@ -117,43 +117,47 @@ class FoxgloveRun:
                     data=message.image,
                     format="jpeg",
                 )
-                yield Shown(f"{CAMERAS}{message.robot}", image)
+                yield FoxgloveMessage(f"{CAMERAS}{message.robot}", image)
 
     def _robot(self, name: str) -> _Robot:
         if name not in self._robots:
             self._robots[name] = _Robot(PALETTE[len(self._robots) % len(PALETTE)])
         return self._robots[name]
 
-    def _of_track(self, at_ns: int, track: Track) -> Iterator[Shown]:
+    def _of_track(self, at_ns: int, track: Track) -> Iterator[FoxgloveMessage]:
         robot, stamp = self._robot(track.robot), _stamp(at_ns)
         robot.track = track
         pose, at = _pose(track.x_m, track.y_m, track.heading_rad), f"/robots/{track.robot}"
-        yield Shown("/tf", FrameTransforms(transforms=[_transform(stamp, track.robot, pose)]))
-        yield Shown(f"{at}/pose", PoseInFrame(timestamp=stamp, frame_id=FIELD, pose=pose))
+        yield FoxgloveMessage(
+            "/tf", FrameTransforms(transforms=[_transform(stamp, track.robot, pose)])
+        )
+        yield FoxgloveMessage(f"{at}/pose", PoseInFrame(timestamp=stamp, frame_id=FIELD, pose=pose))
         uncertain = Odometry(
             timestamp=stamp, frame_id=FIELD, body_frame_id=_frame(track.robot), pose=pose
         )
         if track.covariance is not None:
             uncertain.pose_covariance.extend(_covariance_6x6(*track.covariance))
-        yield Shown(f"{at}/odometry", uncertain)
+        yield FoxgloveMessage(f"{at}/odometry", uncertain)
         if at_ns - robot.scene_ns >= SCENE_NS:
             robot.scene_ns = at_ns
-            yield Shown(f"{at}/scene", SceneUpdate(entities=[_robot_entity(stamp, track, robot)]))
+            yield FoxgloveMessage(
+                f"{at}/scene", SceneUpdate(entities=[_robot_entity(stamp, track, robot)])
+            )
         if at_ns - robot.trail_ns >= TRAIL_NS:
             robot.trail_ns = at_ns
             robot.trail.append(Point3(x=track.x_m, y=track.y_m))
             trail = _line(list(robot.trail), 0.03, robot.colour, 0.6)
             entity = SceneEntity(timestamp=stamp, frame_id=FIELD, id="trail", lines=[trail])
-            yield Shown(f"{at}/trail", SceneUpdate(entities=[entity]))
+            yield FoxgloveMessage(f"{at}/trail", SceneUpdate(entities=[entity]))
 
-    def _of_status(self, at_ns: int, status: Status) -> Iterator[Shown]:
+    def _of_status(self, at_ns: int, status: Status) -> Iterator[FoxgloveMessage]:
         arrows = [
             arrow
             for helper, helped, topic in current_help(status)
             if (arrow := self._help_entity(at_ns, helper, helped, topic)) is not None
         ]
         if arrows:
-            yield Shown("/help", SceneUpdate(entities=arrows))
+            yield FoxgloveMessage("/help", SceneUpdate(entities=arrows))
 
     def _help_entity(self, at_ns: int, helper: str, helped: str, topic: str) -> SceneEntity | None:
         """A line with a head from a helper to the robot that it helps."""
@@ -176,13 +180,13 @@ class FoxgloveRun:
         )
 
 
-def _of_truths(at_ns: int, truths: Truths) -> Iterator[Shown]:
+def _of_truths(at_ns: int, truths: Truths) -> Iterator[FoxgloveMessage]:
     stamp = _stamp(at_ns)
     poses = {t.robot: _pose(t.x_m, t.y_m, t.heading_rad) for t in truths.robots}
     transforms = [_transform(stamp, name, pose, "truth") for name, pose in poses.items()]
-    yield Shown("/tf", FrameTransforms(transforms=transforms))
+    yield FoxgloveMessage("/tf", FrameTransforms(transforms=transforms))
     there = PosesInFrame(timestamp=stamp, frame_id=FIELD, poses=poses.values())
-    yield Shown("/truth/poses", there)
+    yield FoxgloveMessage("/truth/poses", there)
 
 
 def _robot_entity(stamp: Timestamp, track: Track, robot: _Robot) -> SceneEntity:
@@ -215,14 +219,14 @@ def _covariance_6x6(
             yield rows[places[row]][places[column]] if is_planar else 0.0
 
 
-def _log(event: Event) -> Shown:
+def _log(event: Event) -> FoxgloveMessage:
     line = Log(
         timestamp=_stamp(event.at_ns),
         level=LEVELS[event.severity],
         message=event.words,
         name=event.robot,
     )
-    return Shown("/log", line)
+    return FoxgloveMessage("/log", line)
 
 
 def _stamp(at_ns: int) -> Timestamp:

@@ -85,7 +85,7 @@ class _RunWriter:
             self._first_ns = at_ns
             self._add_protobuf(at_ns, *self._foxglove.map(at_ns))
         self._last_ns = max(self._last_ns, at_ns)
-        for topic, shown in self._foxglove.shown(at_ns, message):
+        for topic, shown in self._foxglove.messages_for(at_ns, message):
             self._add_protobuf(at_ns, topic, shown)
         if isinstance(message, AnnotatedFrame):
             message = msgspec.structs.replace(message, image=b"")

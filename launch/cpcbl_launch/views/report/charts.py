@@ -94,7 +94,7 @@ def field(run: RunSummary, robots: Sequence[Drawn]) -> str:
         ends = np.array([wall.from_m, wall.to_m])
         parts.append(line(x.at(ends[:, 0]), y.at(ends[:, 1]), "wall"))
     for robot in robots:
-        truth = _thinned(robot.path.truth)
+        truth = _thin(robot.path.truth)
         if len(truth):
             parts.append(line(x.at(truth[:, 1]), y.at(truth[:, 2]), "true"))
     for robot in robots:
@@ -186,7 +186,7 @@ def _field_end(robot: Drawn, x: Axis, y: Axis, taken: list[tuple[float, float]])
     yield text(px, below, path.name, f"name {robot.colour}", "middle")
 
 
-def _thinned(truth: Floats) -> Floats:
+def _thin(truth: Floats) -> Floats:
     return truth[:: max(1, len(truth) // 700)]
 
 

@@ -21,7 +21,7 @@ class Section(NamedTuple):
     name: str
     title: str
     about: str
-    make: Callable[[sections.Shown], str]
+    make: Callable[[sections.RunView], str]
 
 
 SECTIONS = (
@@ -40,7 +40,7 @@ def report_page(runs: Sequence[RunSummary]) -> str:
     """The page of one run, or of two side by side."""
     robots = [drawn_robots(run) for run in runs]
     scales = common_scales(list(zip(runs, robots, strict=True)))
-    shown = [sections.Shown(run, own, scales) for run, own in zip(runs, robots, strict=True)]
+    shown = [sections.RunView(run, own, scales) for run, own in zip(runs, robots, strict=True)]
     title = " and ".join(dict.fromkeys(run.team.name for run in runs))
     body = "".join(_body(shown))
     kind = ' class="two"' if len(runs) > 1 else ""
@@ -61,7 +61,7 @@ def _style() -> str:
     return colours[: colours.index("* {")] + own
 
 
-def _body(shown: Sequence[sections.Shown]) -> Iterator[str]:
+def _body(shown: Sequence[sections.RunView]) -> Iterator[str]:
     yield "<header>"
     runs = [one.run for one in shown]
     teams = " and ".join(dict.fromkeys(run.team.name for run in runs))
@@ -82,7 +82,7 @@ def _body(shown: Sequence[sections.Shown]) -> Iterator[str]:
     yield f"<footer>Made by cpcbl-team {version} report.</footer>"
 
 
-def _runs(shown: Sequence[sections.Shown], contents: Sequence[str]) -> str:
+def _runs(shown: Sequence[sections.RunView], contents: Sequence[str]) -> str:
     nothing = '<p class="soft">nothing</p>'
     if len(shown) == 1:
         return f'<div class="runs">{contents[0] or nothing}</div>'
@@ -118,7 +118,7 @@ def _remarks(run: RunSummary) -> Iterator[str]:
     yield from run.remarks
 
 
-def _tiles(shown: sections.Shown) -> str:
+def _tiles(shown: sections.RunView) -> str:
     report, team = shown.run.report, shown.run.report.team
     lost = [robot.lost_share for name, robot in report.robots.items() if shown.is_heard(name)]
     tiles: list[tuple[str, str, str]] = []

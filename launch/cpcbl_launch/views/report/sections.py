@@ -50,7 +50,7 @@ SETTINGS_ABOUT = "The team file as the robots had it, without what has its defau
 MOST_CHARTS, MOST_MATRIX, MOST_EVENTS = 24, 40, 300
 
 
-class Shown(NamedTuple):
+class RunView(NamedTuple):
     """A run, with what is drawn of its robots."""
 
     run: RunSummary
@@ -65,7 +65,7 @@ class Shown(NamedTuple):
         return {**self.run.report.robots, **self.run.report.guests}
 
 
-def field_section(shown: Shown) -> str:
+def field_section(shown: RunView) -> str:
     if not any(len(robot.path.times_s) for robot in shown.robots):
         return ""
     return f'<div class="card">{field(shown.run, shown.robots)}</div>'
@@ -74,7 +74,7 @@ def field_section(shown: Shown) -> str:
 # Figures ------------------------------------------------------------------------------------------
 
 
-def robots_section(shown: Shown) -> str:
+def robots_section(shown: RunView) -> str:
     """A row a robot; without truth what the robots state."""
     has_truth = bool(shown.run.truth)
     head = ["RMSE m", "mean", "max", "heading °", "in 3 σ", "NEES"] if has_truth else []
@@ -93,7 +93,7 @@ def robots_section(shown: Shown) -> str:
     return f'<div class="card wide">{_table(["robot", *head], rows)}</div>'
 
 
-def _robot_row(shown: Shown, name: str, colour: str, has_truth: bool) -> str:
+def _robot_row(shown: RunView, name: str, colour: str, has_truth: bool) -> str:
     robot = shown.reports[name]
     cells = []
     if has_truth:
@@ -110,7 +110,7 @@ def _robot_row(shown: Shown, name: str, colour: str, has_truth: bool) -> str:
     return _row(f"{name}{guest}", cells, "", f"dot {colour}")
 
 
-def comparison(one: Shown, other: Shown) -> str:
+def comparison(one: RunView, other: RunView) -> str:
     """The figures of both runs and their difference, of the team and of robots of both."""
     rows = []
     teams = one.run.report.team, other.run.report.team
@@ -142,7 +142,7 @@ def _compared(label: str, a: float | None, b: float | None, digits: int) -> str:
     return _row(label, cells)
 
 
-def time_section(shown: Shown) -> str:
+def time_section(shown: RunView) -> str:
     """A drawing a robot; of very many those that were worst."""
     from cpcbl_launch.reporting.paths import worst_first
 
@@ -151,11 +151,12 @@ def time_section(shown: Shown) -> str:
     if len(heard) > MOST_CHARTS:
         worst = {path.name for path in worst_first([r.path for r in heard])[:MOST_CHARTS]}
         chosen = [robot for robot in heard if robot.path.name in worst]
-    cards = [
-        f'<div class="card {robot.colour}"><h3><span>{escape(_chart_words(shown, robot))}</span>'
-        f'<b class="dot">{escape(robot.path.name)}</b></h3>{over_time(robot, shown.scales, shown.run.duration_s)}</div>'
-        for robot in chosen
-    ]
+    cards = []
+    for robot in chosen:
+        chart = over_time(robot, shown.scales, shown.run.duration_s)
+        name, words = escape(robot.path.name), escape(_chart_words(shown, robot))
+        head = f'<h3><span>{words}</span><b class="dot">{name}</b></h3>'
+        cards.append(f'<div class="card {robot.colour}">{head}{chart}</div>')
     if not cards:
         return ""
     left = len(heard) - len(chosen)
@@ -163,7 +164,7 @@ def time_section(shown: Shown) -> str:
     return f'<div><div class="charts">{"".join(cards)}</div>{more}</div>'
 
 
-def _chart_words(shown: Shown, robot: Drawn) -> str:
+def _chart_words(shown: RunView, robot: Drawn) -> str:
     report, path = shown.reports[robot.path.name], robot.path
     words = []
     if report.position_rmse_m is not None:
@@ -180,7 +181,7 @@ def _chart_words(shown: Shown, robot: Drawn) -> str:
 # Help and traffic ---------------------------------------------------------------------------------
 
 
-def helps_of(shown: Shown) -> dict[tuple[str, str], Counter[str]]:
+def helps_of(shown: RunView) -> dict[tuple[str, str], Counter[str]]:
     """Fixes and beliefs by helper and helped robot."""
     found: dict[tuple[str, str], Counter[str]] = {}
     for name, robot in shown.reports.items():
@@ -192,7 +193,7 @@ def helps_of(shown: Shown) -> dict[tuple[str, str], Counter[str]]:
     return found
 
 
-def help_section(shown: Shown) -> str:
+def help_section(shown: RunView) -> str:
     helps = helps_of(shown)
     if not helps:
         return '<p class="soft">nobody helped anybody</p>'
@@ -208,7 +209,7 @@ def help_section(shown: Shown) -> str:
     return f'<div class="card wide">{pairs}{more}</div>'
 
 
-def traffic_section(shown: Shown) -> str:
+def traffic_section(shown: RunView) -> str:
     """Messages and bytes by kind, what was not sent and why, and each robot's limits."""
     kinds: dict[str, dict[str, Counter[str]]] = {}
     for name, robot in shown.reports.items():
@@ -240,7 +241,7 @@ def traffic_section(shown: Shown) -> str:
     return f'<div class="card wide">{_table(head, rows)}{key}{budget}{none}</div>'
 
 
-def _limit_rows(shown: Shown) -> Iterator[str]:
+def _limit_rows(shown: RunView) -> Iterator[str]:
     for name, robot in shown.reports.items():
         for spent in robot.spending:
             window = f"in {spent.window_s:g} s" if spent.window_s else "in the match"
@@ -253,7 +254,7 @@ def _limit_rows(shown: Shown) -> Iterator[str]:
 # What went wrong ----------------------------------------------------------------------------------
 
 
-def events_section(shown: Shown) -> str:
+def events_section(shown: RunView) -> str:
     """Problems with how long they lasted, then all changes of states in their order."""
     run, rows = shown.run, []
     for name, robot in shown.reports.items():
@@ -309,7 +310,7 @@ def _event_list(run: RunSummary) -> str:
     )
 
 
-def refused_section(shown: Shown) -> str:
+def refused_section(shown: RunView) -> str:
     """A row a reason, a column a robot that refused anything; measurements out of their gate."""
     counts = {
         name: {reason: n for reason, n in robot.counts.items() if reason in REFUSALS and n}
@@ -333,7 +334,7 @@ def refused_section(shown: Shown) -> str:
     return f'<div class="card wide">{_table(["reason", *of_robots], rows)}{gate}</div>'
 
 
-def settings_section(shown: Shown) -> str:
+def settings_section(shown: RunView) -> str:
     text = tomlkit.dumps(non_default_settings(shown.run.team))
     lines = text.count("\n")
     return (
