@@ -29,6 +29,8 @@ COMMANDS = {
     "field": "running.field",
     "compose": "preparing.compose",
     "simulate": "measuring.simulate",
+    "merge": "recorded.merge",
+    "report": "recorded.report",
     "evaluate": "measuring.evaluate",
     "chaos": "measuring.chaos",
     "list": "diagnosing.list_teams",

@@ -10,7 +10,7 @@ import pytest
 
 HEAVY = (
     *("aiohttp", "cv2", "matplotlib", "numpy", "pydantic", "rich", "typer"),
-    *("email", "importlib.metadata"),
+    *("email", "importlib.metadata", "google.protobuf", "mcap"),
 )
 CODE = """
 import json, sys

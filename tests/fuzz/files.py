@@ -36,7 +36,8 @@ from cpcbl_agents.vision.detector import CameraDetector
 from cpcbl_launch.calibration.logs import read_logs
 from cpcbl_launch.calibration.pictures import read_picture
 from cpcbl_launch.lab.evaluation import evaluate_log
-from cpcbl_launch.reporting.recording import TEAM, read_recording
+from cpcbl_launch.reporting.recorded_file import read_recording
+from cpcbl_launch.reporting.recording import TEAM
 from cpcbl_launch.run.logged_team import load_logged_team, with_duration
 from cpcbl_launch.simulation.in_process import simulate
 from cpcbl_launch.team.checks import warnings

@@ -19,7 +19,8 @@ from support.logs import log_team, write_log
 
 from cpcbl_agents.sources.mrclam import LogError
 from cpcbl_launch.calibration.pictures import read_picture
-from cpcbl_launch.reporting.recording import TEAM, read_recording
+from cpcbl_launch.reporting.recorded_file import read_recording
+from cpcbl_launch.reporting.recording import TEAM
 from cpcbl_launch.run.logged_team import load_logged_team
 from cpcbl_launch.team.file import TeamFileError, builtin_path, load_team, save_resolved
 from cpcbl_team.inputs import Odometry

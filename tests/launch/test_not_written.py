@@ -13,7 +13,8 @@ from support.processes import command_line, cpcbl_team
 from support.simulated import simulate_recorded
 
 from cpcbl_launch.commands.options import require_folder, require_writable_file
-from cpcbl_launch.reporting.recording import Recording, read_recording
+from cpcbl_launch.reporting.recorded_file import read_recording
+from cpcbl_launch.reporting.recording import Recording
 from cpcbl_launch.run.processes import PROGRAM, ProcessSpec, Supervisor
 from cpcbl_launch.team.file import TeamFileError, builtin_path, load_team, save_resolved
 from cpcbl_team.config import RobotSettings, Team

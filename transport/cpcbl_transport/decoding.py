@@ -56,6 +56,14 @@ def input_problem(key: str, payload: bytes) -> str:
     return json_problem(payload, topic) if is_json(payload) else decode_error(payload)
 
 
+def carried_type(key: str) -> type[Message]:
+    """The type of the messages under this key. Raises ValueError for a key that carries none."""
+    topic, _ = _topic_of(key)
+    if topic is None or topic.carries is None:
+        raise ValueError(f"no message has the key {key}")
+    return topic.carries
+
+
 @lru_cache(maxsize=4096)
 def _topic_of(key: str) -> tuple[Topic | None, str]:
     """The topic of a key, and the robot that it names, if any."""

@@ -7,14 +7,15 @@ Outputs are sent as JSON under a key of their own (`topics.json_key`).
 
 import re
 from functools import lru_cache
-from typing import Any, get_args, get_origin
+from typing import Any, TypeVar, get_args, get_origin
 
 import msgspec
 
 from cpcbl_team.errors import nearest_name
-from cpcbl_transport.messages import Refusal, SensorInput, Tagged
+from cpcbl_transport.messages import Message, Refusal, SensorInput
 from cpcbl_transport.topics import Topic
 
+MessageT = TypeVar("MessageT", bound=Message)
 _NO_NUMBER = re.compile(rb"[:,\[\s][-+]?(?:NaN|nan|Infinity|inf)\b")
 _REFUSED = (msgspec.DecodeError, UnicodeDecodeError, RecursionError)
 
@@ -49,15 +50,30 @@ def json_problem(payload: bytes, topic: Topic) -> str:
     return ""
 
 
-def encode_json(message: Tagged) -> bytes:
+def encode_json(message: Message) -> bytes:
     """An output as a JSON object."""
-    return msgspec.json.encode(_as_builtins(message))
+    kind: Any = type(message)
+    return msgspec.json.encode(msgspec.convert(message, _object_type(kind), from_attributes=True))
+
+
+def decode_object(payload: bytes, kind: type[MessageT]) -> MessageT:
+    """The message of this type in a JSON object. Raises msgspec.DecodeError and others."""
+    whole: Any = kind
+    found = msgspec.json.decode(payload, type=_object_type(whole))
+    return msgspec.convert(found, kind, from_attributes=True)
+
+
+def object_schema(kind: type[Message]) -> dict[str, Any]:
+    """The JSON schema of the object for a message of this type."""
+    schema = msgspec.json.schema(_object_type(kind))
+    parts = schema.pop("$defs")
+    own: dict[str, Any] = parts.pop(schema["$ref"].rpartition("/")[2])
+    return own | {"$defs": parts} if parts else own
 
 
 def _decode(payload: bytes, topic: Topic) -> SensorInput:
     kind: Any = topic.carries
-    found = msgspec.json.decode(payload, type=_object_type(kind))
-    message: SensorInput = msgspec.convert(found, kind, from_attributes=True)
+    message: SensorInput = decode_object(payload, kind)
     return message
 
 
@@ -91,7 +107,7 @@ def _object_type(kind: Any) -> Any:
         fields = [
             (f.encode_name, _object_type(f.type))
             if f.required
-            else (f.encode_name, _object_type(f.type), f.default)
+            else (f.encode_name, _object_type(f.type), _default(f))
             for f in msgspec.structs.fields(kind)
         ]
         return msgspec.defstruct(kind.__name__, fields, frozen=True, forbid_unknown_fields=True)
@@ -100,9 +116,8 @@ def _object_type(kind: Any) -> Any:
     return kind
 
 
-def _as_builtins(part: Any) -> Any:
-    if isinstance(part, msgspec.Struct):
-        return {name: _as_builtins(getattr(part, name)) for name in part.__struct_fields__}
-    if isinstance(part, tuple):
-        return [_as_builtins(item) for item in part]
-    return part
+def _default(field: msgspec.structs.FieldInfo) -> Any:
+    """The default of a field that has one."""
+    if field.default_factory is msgspec.NODEFAULT:
+        return field.default
+    return msgspec.field(default_factory=field.default_factory)

@@ -38,7 +38,7 @@ from cpcbl_launch.calibration.statistics import (
 )
 from cpcbl_launch.reporting.files import read_csv
 from cpcbl_launch.reporting.metrics import Floats
-from cpcbl_launch.reporting.recording import read_recording
+from cpcbl_launch.reporting.recorded_file import read_recording
 from cpcbl_team.config import CameraSettings, Team
 from cpcbl_team.errors import InputError
 from cpcbl_team.inputs import Sightings

@@ -11,7 +11,7 @@ from cpcbl_agents.sources import mrclam
 from cpcbl_agents.sources.mrclam import LogError
 from cpcbl_launch.calibration.statistics import Mask
 from cpcbl_launch.reporting.metrics import Floats
-from cpcbl_launch.reporting.recording import read_recording
+from cpcbl_launch.reporting.recorded_file import read_recording
 from cpcbl_team.config import Landmark
 from cpcbl_team.inputs import Odometry, Sightings
 

@@ -24,7 +24,7 @@ from cpcbl_launch.calibration.logs import RobotLog, RobotLogs
 from cpcbl_launch.calibration.search_bounds import bound_notes, without_bounds
 from cpcbl_launch.calibration.statistics import Estimate, decimals
 from cpcbl_launch.calibration.team_tables import MINIMUM, team_source
-from cpcbl_launch.reporting.recording import read_recording
+from cpcbl_launch.reporting.recorded_file import read_recording
 from cpcbl_launch.team.file import builtin_path, parse_team
 from cpcbl_team.errors import InputError
 

@@ -62,6 +62,22 @@ class Samples(NamedTuple):
     share: float | None = None  # of the estimates: those that have truth
 
 
+class Ellipse(NamedTuple):
+    """The axes of a covariance in the plane: σ along both (m), and the direction of the first."""
+
+    major_m: float
+    minor_m: float
+    direction_rad: float
+
+
+def ellipse_of(xx: float, xy: float, yy: float) -> Ellipse:
+    """The ellipse of one σ of a covariance (m^2)."""
+    middle, half = 0.5 * (xx + yy), 0.5 * (xx - yy)
+    radius = math.hypot(half, xy)
+    major, minor = math.sqrt(max(0.0, middle + radius)), math.sqrt(max(0.0, middle - radius))
+    return Ellipse(major, minor, 0.5 * math.atan2(xy, half))
+
+
 def stated_sigma_m(path: Trajectory) -> Floats:
     """The standard deviations of the position along one axis, shape (n,), empty without any."""
     if path.covariance is None:

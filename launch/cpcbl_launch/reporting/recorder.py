@@ -40,11 +40,13 @@ from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus
 from cpcbl_transport.decoding import decode
 from cpcbl_transport.messages import (
+    Message,
     Refusal,
     Status,
     Track,
     Truth,
     Truths,
+    encode,
 )
 
 
@@ -171,7 +173,8 @@ MOST_PROCESSES = 256  # of one robot: the statuses of older ones are forgotten
 class Recorder:
     """Subscribes to tracks, status and simulated truth on a bus."""
 
-    def __init__(self, bus: Bus) -> None:
+    def __init__(self, bus: Bus | None = None) -> None:
+        """`bus`: None for a recorded run, whose messages are given by `store`."""
         self._lock = threading.Lock()
         self.tracks: dict[str, EncodedLog[Track]] = {}
         self.status: dict[str, Status] = {}
@@ -182,11 +185,18 @@ class Recorder:
         """Accepted messages by topic, and refused ones by reason."""
         self._problems: dict[str, ProblemLog] = {}
         self._processes: dict[str, dict[str, Status]] = {}  # the last status by incarnation
-        for topic in (topics.TRACK, topics.STATUS, topics.TRUTH):
-            bus.subscribe(topic.at(), self._receive)
+        if bus is not None:
+            for topic in (topics.TRACK, topics.STATUS, topics.TRUTH):
+                bus.subscribe(topic.at(), self._receive)
 
     def _receive(self, key: str, payload: bytes) -> None:
-        message = decode(key, payload)
+        self._store(key, decode(key, payload), payload)
+
+    def store(self, key: str, message: Track | Status | Truths) -> None:
+        """Takes a message of a recorded run."""
+        self._store(key, message, encode(message))
+
+    def _store(self, key: str, message: Message | Refusal, payload: bytes) -> None:
         with self._lock:
             if isinstance(message, Track | Status) and not self._has_room(message.robot):
                 self.counts["too_many_names"] += 1
@@ -217,6 +227,10 @@ class Recorder:
         """Messages that could not be used, by reason."""
         with self._lock:
             return {r: self.counts[r] for r in sorted(Refusal) if self.counts[r]}
+
+    def restarts(self) -> dict[str, int]:
+        """How often a robot was started again, by its statuses; without those that never were."""
+        return {name: len(own) - 1 for name, own in self._processes.items() if len(own) > 1}
 
     def latest(self) -> tuple[dict[str, Track], dict[str, Status], dict[str, Truth]]:
         """The newest track, status and simulated truth of every robot."""

@@ -13,33 +13,17 @@ import threading
 from contextlib import AbstractContextManager, suppress
 from importlib.resources import files
 from pathlib import Path
-from typing import NamedTuple
 
 import msgspec
 from mcap.exceptions import McapError
-from mcap.reader import make_reader
 from mcap.writer import Writer
 from zstandard import ZstdError
 
-from cpcbl_agents.sources.mrclam import LogError
-from cpcbl_launch.reporting.metrics import Floats
-from cpcbl_launch.reporting.recorder import truth_rows
-from cpcbl_launch.team.faults import one_line
-from cpcbl_launch.team.file import decode_resolved
 from cpcbl_team.config import Team
-from cpcbl_team.inputs import InitialPose, Odometry, Position, Sightings
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus
 from cpcbl_transport.decoding import decode
-from cpcbl_transport.messages import (
-    LAST_NS,
-    AnnotatedFrame,
-    Message,
-    Refusal,
-    SensorInput,
-    Truths,
-    refusal,
-)
+from cpcbl_transport.messages import AnnotatedFrame, Message, Refusal
 
 log = logging.getLogger(__name__)
 
@@ -50,12 +34,11 @@ RECORDED = (
 )
 TEAM = "team.json"
 CHUNK_BYTES = 262_144  # of messages that wait in memory, with as much for their index
-PICTURE = "foxglove.CompressedImage"
+PICTURE, PICTURES = "foxglove.CompressedImage", "picture/"  # schema, beginning of keys
 DAMAGE = (  # what the readers of MCAP, its compressions and its contents raise of a damaged file
     *(McapError, struct.error, ZstdError, RuntimeError, msgspec.MsgspecError),
     *(ValueError, LookupError, OverflowError, EOFError, MemoryError),
 )
-_decoder: msgspec.json.Decoder[Message] = msgspec.json.Decoder(Message)
 
 
 class Recording(AbstractContextManager["Recording"]):
@@ -98,13 +81,13 @@ class Recording(AbstractContextManager["Recording"]):
                     "data": message.image,
                     "format": "jpeg",
                 }
-                self._add(writer, f"picture/{message.robot}", message.stamp_ns, picture)
+                self._add(writer, f"{PICTURES}{message.robot}", message.stamp_ns, picture)
             message = msgspec.structs.replace(message, image=b"")
         self._add(writer, key, message.stamp_ns, message)
 
     def _add(self, writer: Writer, key: str, at_ns: int, content: object) -> None:
         if key not in self._channels:
-            schema = self._schema if key.startswith("picture/") else 0
+            schema = self._schema if key.startswith(PICTURES) else 0
             self._channels[key] = writer.register_channel(key, "json", schema)
         writer.add_message(self._channels[key], at_ns, msgspec.json.encode(content), at_ns)
 
@@ -127,50 +110,3 @@ class Recording(AbstractContextManager["Recording"]):
                 self._file.close()
             except OSError as error:
                 self._give_up(error)
-
-
-class RecordedRun(NamedTuple):
-    """What a recording says: inputs and truth (rows of s, x, y, heading) by robot.
-
-    Of robots with cameras, sightings are those of the frames that were shown: twice a second.
-    """
-
-    team: Team
-    inputs: dict[str, list[SensorInput]]
-    truth: dict[str, Floats]
-
-
-def _check_message(message: Message) -> Message:
-    """A message that could have been recorded. Raises ValueError."""
-    if reason := refusal(message, LAST_NS):
-        raise ValueError(f"a message that no robot takes: {reason}")
-    return message
-
-
-def read_recording(path: Path) -> RecordedRun:
-    """What `Recording` wrote. Raises LogError, TeamFileError."""
-    try:
-        with path.open("rb") as file:
-            reader = make_reader(file)
-            attached = [a.data for a in reader.iter_attachments() if a.name == TEAM]
-            messages = [
-                (channel.topic, _check_message(_decoder.decode(message.data)))
-                for _, channel, message in reader.iter_messages()
-                if channel.topic.startswith(("in/", "look/", topics.TRUTH.key))
-            ]
-        if not attached:
-            raise LogError(f"{path}: holds no team: not a recording of `up --record`")
-        team = decode_resolved(attached[0], f"{path}: {TEAM}")
-    except OSError as error:
-        raise LogError(f"{path}: cannot be read: {error.strerror or error}") from error
-    except DAMAGE as error:
-        what = one_line(f"{type(error).__name__} {error}")
-        raise LogError(f"{path}: not a whole recording: {what}") from error
-    truths = [message for _, message in messages if isinstance(message, Truths)]
-    inputs: dict[str, list[SensorInput]] = {}
-    for key, message in messages:
-        if isinstance(message, AnnotatedFrame):  # what the robot's eyes found in a frame
-            message = Sightings(message.stamp_ns, message.found)
-        if isinstance(message, Odometry | Sightings | Position | InitialPose):
-            inputs.setdefault(key.split("/")[1], []).append(message)
-    return RecordedRun(team, inputs, truth_rows(truths))

@@ -121,6 +121,23 @@ def problem_remarks(robot: str, problems: Iterable[ProblemReport]) -> Iterator[s
         yield f"Robot {robot}, for {problem.seconds:.0f} s: {problem.text}{stop}"
 
 
+def is_current(flow: Flow, now_ns: int) -> bool:
+    """Whether help is given at present: its latest message is no older than 3 s."""
+    return bool(flow.messages) and now_ns - flow.latest_ns <= CURRENT_HELP_NS
+
+
+def current_help(status: Status) -> Iterator[tuple[str, str, str]]:
+    """Who helps whom at present, and by which topic, as a robot counts it: the fixes that it sends,
+    and the beliefs that it hears, which any may read."""
+    for flow in status.sent:
+        if flow.topic == "fix" and flow.peer and is_current(flow, status.stamp_ns):
+            yield status.robot, flow.peer, flow.topic
+    for flow in status.heard:
+        if flow.topic == "belief" and flow.peer and is_current(flow, status.stamp_ns):
+            yield flow.peer, status.robot, flow.topic
+
+
+CURRENT_HELP_NS = 3_000_000_000
 COUNTS = ("messages", "bytes", "over_budget", "worthless", "silent")
 
 

@@ -18,6 +18,7 @@ from cpcbl_launch.reporting.statuses import (
     FlowReport,
     SpendingReport,
     TrustReport,
+    is_current,
     summed_flows,
     summed_spending,
     trust_reports,
@@ -28,7 +29,6 @@ from cpcbl_transport.decoding import Received, Subscriber
 from cpcbl_transport.messages import Flow, Status
 from cpcbl_transport.security import Link
 
-CURRENT_HELP_NS = 3_000_000_000  # help is given at present whose latest message is no older
 RATES_NS = 5_000_000_000  # rates are over the last so many seconds of robot time
 SILENT_AWAY_S = 3.0  # so long, and three of its pauses, a robot is silent before it is away
 REFRESH_S = 0.25
@@ -139,7 +139,7 @@ def _live_flows(
             **msgspec.structs.asdict(report),
             messages_per_s=(flow.messages - old.messages) / elapsed_s if elapsed_s else None,
             bytes_per_s=(flow.bytes - old.bytes) / elapsed_s if elapsed_s else None,
-            at_present=bool(flow.messages) and last.stamp_ns - flow.latest_ns <= CURRENT_HELP_NS,
+            at_present=is_current(flow, last.stamp_ns),
         )
 
 

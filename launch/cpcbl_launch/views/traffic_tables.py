@@ -8,13 +8,14 @@ from rich.text import Text
 
 from cpcbl_launch.reporting.recorder import Report, RobotReport
 from cpcbl_launch.reporting.statuses import (
+    CURRENT_HELP_NS,
     FlowReport,
     SpendingReport,
     are_limits_kept,
 )
 from cpcbl_launch.reporting.tables import number, short, table
 from cpcbl_launch.views.live import LiveView
-from cpcbl_launch.views.traffic import CURRENT_HELP_NS, RATES_NS, HelpLink, LiveRobot, Traffic
+from cpcbl_launch.views.traffic import RATES_NS, HelpLink, LiveRobot, Traffic
 
 COLOURS = {"fix": "cyan", "belief": "magenta"}
 NOT_SENT = {"budget": "over_budget", "value": "worthless", "silence": "silent"}

@@ -12,7 +12,7 @@ from support.simulated import simulate_recorded
 from cpcbl_launch.calibration.logs import read_log, read_logs
 from cpcbl_launch.calibration.odometry import calibrate_odometry
 from cpcbl_launch.calibration.team_types import Calibration, calibrate_robots, non_default_settings
-from cpcbl_launch.reporting.recording import read_recording
+from cpcbl_launch.reporting.recorded_file import read_recording
 from cpcbl_launch.simulation.in_process import simulate
 from cpcbl_launch.team.file import load_team
 from cpcbl_team.config import Team

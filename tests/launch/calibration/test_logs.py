@@ -14,7 +14,7 @@ from support.simulated import simulate_recorded
 from cpcbl_agents.sources.mrclam import LogError
 from cpcbl_launch.calibration.logs import read_log, read_logs
 from cpcbl_launch.calibration.team_types import calibrate_robots
-from cpcbl_launch.reporting.recording import read_recording
+from cpcbl_launch.reporting.recorded_file import read_recording
 from cpcbl_team.config import (
     Team,
 )
@@ -43,8 +43,9 @@ def no_recording(path: Path) -> None:
 
 
 def cut_short(path: Path) -> None:
+    """In its team, which is the first part."""
     simulate_recorded(TEAM, 1, 2.0, path)
-    path.write_bytes(path.read_bytes()[:-300])
+    path.write_bytes(path.read_bytes()[:300])
 
 
 @pytest.mark.parametrize(
@@ -52,7 +53,7 @@ def cut_short(path: Path) -> None:
     [
         (without_truth, "holds no truth"),
         (no_recording, "not a whole recording"),
-        (cut_short, "not a whole recording"),
+        (cut_short, "holds no team"),
         (lambda path: None, "cannot be read"),
     ],
     ids=["no truth", "no recording", "cut short", "not there"],

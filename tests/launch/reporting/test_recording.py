@@ -9,7 +9,8 @@ from support.logs import write_log
 from support.processes import cpcbl_team
 from support.simulated import simulate_recorded
 
-from cpcbl_launch.reporting.recording import Recording, read_recording
+from cpcbl_launch.reporting.recorded_file import read_recording
+from cpcbl_launch.reporting.recording import Recording
 from cpcbl_launch.simulation.in_process import simulate
 from cpcbl_launch.team.file import builtin_path, load_team
 from cpcbl_team.config import RobotSettings, Team

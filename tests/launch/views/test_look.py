@@ -16,7 +16,7 @@ from support.processes import command_line, cpcbl_team, eventually
 
 from cpcbl_agents.vision.camera import Camera
 from cpcbl_agents.vision.pictures import read_header
-from cpcbl_launch.reporting.recording import read_recording
+from cpcbl_launch.reporting.recorded_file import read_recording
 from cpcbl_launch.run.processes import PROGRAM
 from cpcbl_launch.run.up import free_endpoint
 from cpcbl_launch.simulation.camera.render import Light, Scene, SceneRobot, render

@@ -1,10 +1,9 @@
 """visualization_msgs/MarkerArray for RViz: where the robots are and how sure, the landmarks, and
 who helps whom."""
 
-import math
 from collections.abc import Iterable, Mapping
-from typing import NamedTuple
 
+from cpcbl_launch.reporting.metrics import ellipse_of
 from cpcbl_launch.run.ros2.planar import Fields, header_fields, pose_fields
 from cpcbl_team.config import Field
 from cpcbl_team.geometry import Pose2
@@ -17,22 +16,6 @@ SECOND_NS = 1_000_000_000
 Colour = tuple[float, float, float, float]
 GREEN, RED = (0.2, 0.8, 0.3, 0.5), (0.9, 0.2, 0.2, 0.5)
 GREY, BLUE = (0.6, 0.6, 0.6, 0.9), (0.2, 0.4, 1.0, 0.8)
-
-
-class Ellipse(NamedTuple):
-    """The axes of a covariance in the plane: σ along both (m), and the direction of the first."""
-
-    major_m: float
-    minor_m: float
-    direction_rad: float
-
-
-def ellipse_of(xx: float, xy: float, yy: float) -> Ellipse:
-    """The ellipse of one σ of a covariance (m^2)."""
-    middle, half = 0.5 * (xx + yy), 0.5 * (xx - yy)
-    radius = math.hypot(half, xy)
-    major, minor = math.sqrt(max(0.0, middle + radius)), math.sqrt(max(0.0, middle - radius))
-    return Ellipse(major, minor, 0.5 * math.atan2(xy, half))
 
 
 def markers_message(

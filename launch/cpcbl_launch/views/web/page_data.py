@@ -7,7 +7,7 @@ from typing import Any
 import msgspec
 
 from cpcbl_agents.robot_state import RobotState, Severity, Word, robot_state
-from cpcbl_launch.reporting.metrics import degrees
+from cpcbl_launch.reporting.metrics import degrees, ellipse_of
 from cpcbl_launch.reporting.statuses import SpendingReport, TrustReport
 from cpcbl_launch.views.traffic import LiveFlow, Traffic
 from cpcbl_launch.views.web.feed import LatestMessages, Snapshot, position_sigma_m
@@ -191,13 +191,6 @@ def state_of(latest: LatestMessages, now_s: float) -> RobotState:
         pause_s=latest.pause_s,
         ended_s=None if lost_s is None else now_s - lost_s,
     )
-
-
-def ellipse_of(xx: float, xy: float, yy: float) -> Triple:
-    """Semi-axes of one sigma (m) of a covariance, and the direction of the longer one (rad)."""
-    mean, half = 0.5 * (xx + yy), math.hypot(0.5 * (xx - yy), xy)
-    angle = 0.5 * math.atan2(2.0 * xy, xx - yy)
-    return math.sqrt(max(0.0, mean + half)), math.sqrt(max(0.0, mean - half)), angle
 
 
 def notice_text(now: Snapshot, team: str, where: str, now_s: float) -> str:

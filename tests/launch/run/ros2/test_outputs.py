@@ -5,6 +5,7 @@ import math
 import pytest
 from support.ros2 import T0, lab, message, message_types
 
+from cpcbl_launch.reporting.metrics import ellipse_of
 from cpcbl_launch.run.ros2.building import build_message
 from cpcbl_launch.run.ros2.diagnostics_out import (
     ERROR,
@@ -15,7 +16,7 @@ from cpcbl_launch.run.ros2.diagnostics_out import (
     diagnostics_message,
     robot_diagnostic,
 )
-from cpcbl_launch.run.ros2.markers_out import ellipse_of, helpers, markers_message
+from cpcbl_launch.run.ros2.markers_out import helpers, markers_message
 from cpcbl_launch.run.ros2.odometry_in import TrackPoint
 from cpcbl_launch.run.ros2.planar import planar_pose, stamp_of
 from cpcbl_launch.run.ros2.poses_out import (

@@ -10,13 +10,13 @@ import pytest
 from support.buses import SECOND
 from support.traffic import flow, seen, status
 
+from cpcbl_launch.reporting.metrics import ellipse_of
 from cpcbl_launch.team.file import find_team
 from cpcbl_launch.views.traffic import traffic_from_statuses
 from cpcbl_launch.views.web.feed import LatestMessages, Snapshot
 from cpcbl_launch.views.web.page_data import (
     RobotPicture,
     difference,
-    ellipse_of,
     help_arrows,
     notice_text,
     robot_detail,
