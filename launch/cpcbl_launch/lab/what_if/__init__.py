@@ -1,0 +1,1 @@
+"""A recorded run again, with something else: what each robot, landmark and message was worth."""
