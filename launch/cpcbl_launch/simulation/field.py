@@ -9,7 +9,7 @@ from collections.abc import Iterable
 from functools import partial
 from itertools import product
 
-from cpcbl_launch.simulation.robot import SimulatedRobot, VisibleObject
+from cpcbl_launch.simulation.robot import Noise, SimulatedRobot, VisibleObject
 from cpcbl_team.config import SimulationEvent, Team
 from cpcbl_team.geometry import Pose2, wrap_angle
 from cpcbl_team.inputs import Sightings
@@ -50,16 +50,16 @@ class Grid:
 class SimulatedField:
     """All robots of a team on one field, in fixed steps of time."""
 
-    def __init__(self, team: Team, seed: int, start_ns: int) -> None:
-        self.team, self._seed = team, seed
+    def __init__(self, team: Team, seed: int, start_ns: int, is_paired: bool = False) -> None:
+        """`is_paired`: its errors are those of a field with more or fewer robots or landmarks."""
+        self.team, self._seed, self._is_paired = team, seed, is_paired
         self._step_ns = int(1e9 / team.simulation.step_rate_hz)
         self.now_ns = start_ns
         noise, first_ns = team.simulation.noise, start_ns + self._step_ns
         self.robots = {
             name: SimulatedRobot(
                 robot,
-                noise,
-                (seed, i),
+                Noise(noise, (seed, *name.encode(), 256) if is_paired else (seed, i), is_paired),
                 start_ns,
                 self._step_ns,
                 _first_frame_ns(team, name, first_ns),
@@ -90,7 +90,9 @@ class SimulatedField:
         """A guest has a body from now on. Its noise is its own: the others' stays what it was."""
         settings = settings_from_model(model)
         seed, noise = (self._seed, _GUEST_SEED, *name.encode()), self.team.simulation.noise
-        self.robots[name] = SimulatedRobot(settings, noise, seed, self.now_ns, self._step_ns)
+        self.robots[name] = SimulatedRobot(
+            settings, Noise(noise, seed, self._is_paired), self.now_ns, self._step_ns
+        )
         self._update_sensing_range()
 
     def remove_guest(self, name: str) -> None:

@@ -92,26 +92,47 @@ def sensor_reading(
     return reading_m, wrap_angle(reading)
 
 
+class Noise:
+    """The random errors of one robot: from one stream, or from one for each source of errors.
+
+    With a stream for each, an object that is hidden, or a robot that is away, changes no error of
+    anything else: two such runs can be compared sample by sample.
+    """
+
+    def __init__(self, factor: float, seed: Sequence[int], is_split: bool) -> None:
+        self._factor, self._seed, self._is_split = factor, seed, is_split
+        self._streams: dict[str, np.random.Generator] = {}
+
+    def normal(self, sigma: float, source: str) -> float:
+        """An error of this source, with this standard deviation times the factor."""
+        if not sigma:
+            return 0.0
+        name = source if self._is_split else ""
+        if name not in self._streams:
+            self._streams[name] = np.random.default_rng((*self._seed, *name.encode()))
+        return float(self._streams[name].normal(0.0, sigma)) * self._factor
+
+
 class SimulatedRobot:
     """One robot of the field: its true pose and its imperfect senses."""
 
     def __init__(
         self,
         settings: RobotSettings,
-        noise: float,
-        seed: Sequence[int],
+        noise: Noise,
         start_ns: int,
         step_ns: int,
         frames_from_ns: int | None = None,
     ) -> None:
         assert settings.start is not None
         self.settings, self._noise = settings, noise
-        self._random = np.random.default_rng(seed)
         start = settings.start
         self.pose = Pose2(
-            start.x_m + self._normal(start.sigma_m),
-            start.y_m + self._normal(start.sigma_m),
-            wrap_angle(math.radians(start.heading_deg + self._normal(start.heading_sigma_deg))),
+            start.x_m + noise.normal(start.sigma_m, "start"),
+            start.y_m + noise.normal(start.sigma_m, "start"),
+            wrap_angle(
+                math.radians(start.heading_deg + noise.normal(start.heading_sigma_deg, "start"))
+            ),
         )
         self.drive = Drive("", 0, 0.0, 0.0)
         self.bumps = 0
@@ -139,7 +160,9 @@ class SimulatedRobot:
         crawled = time_at_min_speed_s(distance, seconds, o)
         in_its_direction = motion_noise(-0.5 * turn, distance, turn, o, crawled)
         along, around = math.sqrt(in_its_direction.xx), math.sqrt(in_its_direction.hh)
-        self.pose = step(self.pose, distance + self._normal(along), turn + self._normal(around))
+        normal = self._noise.normal
+        distance, turn = distance + normal(along, "motion"), turn + normal(around, "motion")
+        self.pose = step(self.pose, distance, turn)
 
     def odometry(self, now_ns: int) -> Odometry | None:
         """The piece since the last one, when it is due; as reported, before any correction."""
@@ -174,7 +197,7 @@ class SimulatedRobot:
         if sensor is None:
             return []
         if self._position_timer.is_due(now_ns):
-            x, y = (v + self._normal(sensor.sigma_m) for v in self.pose[:2])
+            x, y = (v + self._noise.normal(sensor.sigma_m, "position") for v in self.pose[:2])
             variance, stamp_ns = sensor.sigma_m**2, now_ns + int(sensor.delay_s * 1e9)
             self._positions.append(Position(stamp_ns, x, y, (variance, 0.0, variance)))
         return _pop_due(self._positions, now_ns)
@@ -201,19 +224,18 @@ class SimulatedRobot:
 
     def _reading_error(self, name: str, kind: str, sigma: float, now_ns: int) -> float:
         """The error of a reading: white, or like the last one of the same object (Gauss-Markov)."""
+        source = f"{name} {kind}"
         if not self.settings.sensor.correlation_s:
-            return self._normal(sigma)
+            return self._noise.normal(sigma, source)
         last = self._errors.get((name, kind))
         if last is None:
-            unit = self._normal(1.0)
+            unit = self._noise.normal(1.0, source)
         else:
             alike = math.exp((last[0] - now_ns) * 1e-9 / self.settings.sensor.correlation_s)
-            unit = alike * last[1] + self._normal(math.sqrt(1.0 - alike * alike))
+            new = self._noise.normal(math.sqrt(1.0 - alike * alike), source)
+            unit = alike * last[1] + new
         self._errors[name, kind] = now_ns, unit
         return sigma * unit
-
-    def _normal(self, sigma: float) -> float:
-        return float(self._random.normal(0.0, sigma)) * self._noise if sigma else 0.0
 
 
 Stamped = TypeVar("Stamped", bound=Sightings | Frame | Position)

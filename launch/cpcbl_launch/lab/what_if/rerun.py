@@ -169,7 +169,10 @@ class _Polled(OwnCamera):
             for t in process.taken
             if t.way == way
         )
-        self.counts: Counter[str] = Counter()
+
+    @property
+    def counts(self) -> Counter[str]:
+        return Counter()
 
     @property
     def next_ns(self) -> int | None:
@@ -195,7 +198,6 @@ class _FedDetection(Detection):
     problems = ()
 
     def __init__(self) -> None:
-        self.counts: Counter[str] = Counter()
         self.has_news = False
         self._found: list[DetectedFrame] = []
         self._submitted_ns = self._collected_ns = -1
@@ -207,6 +209,10 @@ class _FedDetection(Detection):
         else:
             self._found.append(DetectedFrame(self._submitted_ns, reason))
         self.has_news = True
+
+    @property
+    def counts(self) -> Counter[str]:
+        return Counter()
 
     @property
     def is_busy(self) -> bool:

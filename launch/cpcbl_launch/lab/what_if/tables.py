@@ -1,11 +1,11 @@
 """A what-if as tables and remarks, for people."""
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 from rich.console import RenderableType
 
-from cpcbl_launch.lab.what_if.comparison import STATED, WhatIf
+from cpcbl_launch.lab.what_if.comparison import STATED, RobotFigures, TeamFigures, WhatIf
 from cpcbl_launch.reporting.tables import cells, number, table
 
 FAR_M = 0.05  # a run that is made again is expected within this distance of the recorded one
@@ -22,21 +22,27 @@ def tables(result: WhatIf) -> Iterable[RenderableType]:
 def _runs(result: WhatIf) -> RenderableType:
     columns = [("recorded", result.recorded), ("again", result.again), ("changed", result.changed)]
     runs = [(name, run) for name, run in columns if run is not None]
+    value = "sigma_m" if result.basis == STATED else "rmse_m"
+    unit = "σ m" if result.basis == STATED else "RMSE m"
     title = f"{result.run}, {result.seconds:.0f} s: {result.change}"
-    names = [f"{name} {unit}" for unit in ("RMSE m", "σ m", "sent") for name, _ in runs]
-    shown = table(title, ("robot",), (*names, "apart m", "most m"))
+    names = [f"{name}\n{what}" for what in (unit, "sent") for name, _ in runs]
+    shown = table(title, ("robot",), (*names, "apart\nm", "at most\nm"))
     last = result.changed or result.again
     for robot, figures in last.robots.items():
-        of_robot = [run.robots.get(robot) for _, run in runs]
-        rmse = [number(None if r is None else r.rmse_m) for r in of_robot]
-        sigma = [number(None if r is None else r.sigma_m) for r in of_robot]
-        sent = [str(r.messages_sent) if r else "-" for r in of_robot]
-        shown.add_row(robot, *rmse, *sigma, *sent, *cells(figures, "apart_m:.3f apart_most_m:.3f"))
+        shown.add_row(
+            robot,
+            *_cells([run.robots.get(robot) for _, run in runs], value),
+            *cells(figures, "apart_m:.3f apart_most_m:.3f"),
+        )
     shown.add_section()
-    teams = [run.team for _, run in runs]
-    rmse, sigma = [number(t.rmse_m, 3) for t in teams], [number(t.sigma_m, 3) for t in teams]
-    shown.add_row("team", *rmse, *sigma, *(str(t.messages_sent) for t in teams), "", "")
+    shown.add_row("team", *_cells([run.team for _, run in runs], value), "", "")
     return shown
+
+
+def _cells(figures: Sequence[RobotFigures | TeamFigures | None], value: str) -> list[str]:
+    """A value of each run, then the messages of each."""
+    values = [number(None if f is None else getattr(f, value)) for f in figures]
+    return values + ["-" if f is None else str(f.messages_sent) for f in figures]
 
 
 def _ledger(result: WhatIf) -> RenderableType:
