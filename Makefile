@@ -9,7 +9,7 @@ export PYTHONDONTWRITEBYTECODE =
 
 .PHONY: setup demo test quick check unit test-long test-ros2 test-trial test-compiled test-docker test-bench \
   chaos net fuzz compiled bench bench-degraded bench-detection bench-latency bench-pictures \
-  bench-processes bench-scaling bench-view bench-what-if screenshot clean
+  bench-processes bench-scaling bench-view bench-pairs screenshot clean
 
 setup: $(VENV)/ready
 
@@ -116,7 +116,7 @@ bench: test-bench
 # Measurements, each with options of its own (ARGS=--help). Real processes over Zenoh, alone on the
 # machine: latency, processes (ARGS='--team-sizes 40,48,60 --old ../earlier-checkout'). In one process:
 # scaling (teams of any size), detection (rendered frames), pictures (ARGS='SET FOLDER': real ones).
-bench-detection bench-latency bench-pictures bench-processes bench-scaling bench-what_if: setup
+bench-detection bench-latency bench-pictures bench-processes bench-scaling bench-pairs: setup
 	@mkdir -p build
 	PYTHONPATH=$(BENCH_PATH) $(BIN)/python -m benchmarks.$(@:bench-%=%) $(ARGS)
 

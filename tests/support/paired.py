@@ -4,12 +4,13 @@ Robots drive as they are commanded beforehand (open loop) or by their own estima
 Every source of errors has a random stream of its own, so both runs of a pair sense the same.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from heapq import heappop, heappush
 from itertools import count
 from pathlib import Path
 from random import Random
+from types import MappingProxyType
 from typing import NamedTuple
 
 from msgspec.structs import replace
@@ -43,7 +44,7 @@ class World(NamedTuple):
     team: Team
     seed: int
     duration_s: float
-    drives: Drives = {}  # noqa: RUF012
+    drives: Drives = MappingProxyType({})
     """The commands of all robots; empty: they drive by their estimates."""
     most_delay_s: float = 0.0  # of a message between two robots, each drawn from 0 to this
 
@@ -68,20 +69,22 @@ def changed_world(world: World, change: Change) -> tuple[World, Team]:
         marks[name] = replace(marks[name], gives="none")
     kept = {n: r for n, r in team.robots.items() if n not in change.without}
     truth = replace(team, robots=kept, map=replace(team.map, landmarks=marks))
-    for text in change.settings:
+    for text in change.settings:  # what robots believe: their errors stay what they were
         team = with_setting(team, text)
     believed = {n: r for n, r in team.robots.items() if n not in change.without}
     return world._replace(team=replace(team, robots=believed)), truth
 
 
 def simulate_world(
-    world: World, truth: Team | None = None, folder: Path | None = None, watch: object = None
+    world: World,
+    truth: Team | None = None,
+    folder: Path | None = None,
+    watch: Callable[[Bus], object] = lambda bus: None,
 ) -> Report:
     """The world once; `folder`: of the run, into which all robots record."""
     team, hub = world.team, MemoryHub()
     recorder, delays = Recorder(hub.session()), _Delays(world)
-    if callable(watch):
-        watch(hub.session())
+    watch(hub.session())
     field = SimulatedField(truth or team, world.seed, 0, is_paired=True)
     first = [FieldNode(field, hub.session()), _Commands(world.drives, hub.session()), delays]
     with ExitStack() as stack:
@@ -192,10 +195,16 @@ class _Timed(Steppable):
 SIZE, SECONDS = 5, 60.0
 
 
-def pair(number: int, is_open: bool, most_delay_s: float = 0.0) -> tuple[World, Change]:
+def pair(
+    number: int,
+    is_open: bool,
+    most_delay_s: float = 0.0,
+    size: int = SIZE,
+    duration_s: float = SECONDS,
+) -> tuple[World, Change]:
     """A world of a mixed team, and what is changed in it: robots, landmarks, settings in turn."""
-    team = mixed_team(SIZE, number)
-    helper, other = "r00", f"r0{1 + number % 4}"
+    team = mixed_team(size, number)
+    helper, other = "r00", f"r0{1 + number % (size - 1)}"
     mark = f"m{number % len(team.map.landmarks)}"
     changes = (
         Change(without=(helper,)),
@@ -207,5 +216,5 @@ def pair(number: int, is_open: bool, most_delay_s: float = 0.0) -> tuple[World, 
         Change(settings=("variant=circular",)),
         Change(settings=(f"robots.{helper}.sensor.sees_robots=false",)),
     )
-    world = World(team, number, SECONDS, most_delay_s=most_delay_s)
+    world = World(team, number, duration_s, most_delay_s=most_delay_s)
     return (open_loop(world) if is_open else world), changes[number % len(changes)]

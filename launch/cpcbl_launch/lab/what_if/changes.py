@@ -15,7 +15,7 @@ from cpcbl_launch.lab.what_if.inputs import (
     RecordedProcess,
     Taken,
 )
-from cpcbl_launch.team.faults import one_line
+from cpcbl_launch.team.faults import layer_faults, one_line, table_faults
 from cpcbl_launch.team.file import TeamFileError, decode_resolved
 from cpcbl_launch.team.overrides import Overrides, with_overrides
 from cpcbl_team.config import RobotSettings, Team
@@ -32,6 +32,15 @@ from cpcbl_transport.messages import (
 
 SENSORS = ("sightings", "position", "initial_pose")
 """What a robot can do without; without odometry nothing is left of a run."""
+SHORT = {
+    "variant": "localizer.variant",
+    "fusion": "collaboration.fusion",
+    "direction": "collaboration.direction",
+    "bytes_per_s": "collaboration.budget.bytes_per_s",
+    "messages_per_minute": "collaboration.budget.messages_per_minute",
+    "match_messages": "match.messages",
+}
+"""Keys by the names of the options that `evaluate` has for them."""
 COLLABORATION = ("none", "passive", "active", "both")
 RECORDED_KEYS = {
     "sensing": "the sightings are those that were recorded",
@@ -178,58 +187,55 @@ def with_setting(team: Team, text: str) -> Team:
     if not equals:
         raise InputError(f"--set {text}: not KEY=VALUE; write e.g. --set fusion=naive")
     value = _value(word)
-    if key in Overrides._fields:
-        if key == "collaboration" and value not in COLLABORATION:
+    if key == "collaboration":
+        if value not in COLLABORATION:
             raise InputError(f"--set {text}: unknown; write one of {', '.join(COLLABORATION)}")
-        overrides: dict[str, Any] = {key: value}
-        return _usable(with_overrides(team, Overrides(**overrides)), text)
+        return with_overrides(team, Overrides(collaboration=value))
+    robot, parts = _robot_of(text), SHORT.get(key, key).removeprefix("defaults.").split(".")
+    if robot:
+        parts = parts[2:]
+    is_of_robots = bool(robot) or parts[0] in RobotSettings.__struct_fields__
+    _refuse_faults(text, parts, value, is_of_robots)
     raw: dict[str, Any] = msgspec.to_builtins(team)
-    parts = key.split(".")
-    if parts[0] == "defaults" and len(parts) > 1:
-        parts = parts[1:]
-    _refuse_recorded(text, parts)
     tables: list[dict[str, Any]] = [raw]
-    if _robot_of(text):
-        tables, parts = [raw["robots"][parts[1]]], parts[2:]
-    elif parts[0] in RobotSettings.__struct_fields__:
-        tables = [*raw["robots"].values(), raw["defaults"]]
+    if is_of_robots:
+        tables = [raw["robots"][robot]] if robot else [*raw["robots"].values(), raw["defaults"]]
     for table in tables:
         _set(table, parts, value, text)
-    return _usable(msgspec.json.encode(raw), text)
+    try:
+        return decode_resolved(msgspec.json.encode(raw), f"--set {text}")
+    except TeamFileError as error:
+        raise InputError(one_line(str(error).splitlines()[0])) from error
 
 
-def _refuse_recorded(text: str, parts: list[str]) -> None:
-    last = parts[2:] if parts[0] == "robots" and len(parts) > 2 else parts
-    for part in {last[0], last[-1]}:
+def _refuse_faults(text: str, parts: list[str], value: object, is_of_robots: bool) -> None:
+    """Raises InputError for a key or a value that no team file has, or that a recorded run has
+    already used."""
+    if not is_of_robots and parts[0] not in Team.__struct_fields__:
+        known = {*SHORT, "collaboration", *RobotSettings.__struct_fields__}
+        near = nearest_name(parts[0], known | {*Team.__struct_fields__})
+        hint = f"did you mean {near}?" if near else "see the keys of team files"
+        raise InputError(f"--set {text}: no such key; {hint}")
+    for part in {parts[0], parts[-1]}:
         if part in RECORDED_KEYS:
             why = RECORDED_KEYS[part]
             raise InputError(f"--set {text}: changes nothing in a recorded run: {why}")
+    table: Any = value
+    for part in reversed(parts):
+        table = {part: table}
+    whole = {"name": "x", "robots": {"x": {}}, **table}
+    path = ".".join(parts)  # what else is missing in its table is in the run
+    for fault in layer_faults(table) if is_of_robots else table_faults(whole):
+        if f"{path}.".startswith(f"{fault.key}."):
+            raise InputError(f"--set {text}: {one_line(str(fault))}")
 
 
 def _set(table: dict[str, Any], parts: list[str], value: object, text: str) -> None:
-    for depth, part in enumerate(parts):
-        if part not in table:
-            near = nearest_name(part, table)
-            hint = f"did you mean {'.'.join([*parts[:depth], near])}?" if near else ""
-            known = f"there are {', '.join(sorted(table))}"
-            raise InputError(f"--set {text}: no such key; {hint or known}")
-        if depth == len(parts) - 1:
-            table[part] = value
-            return
-        if not isinstance(table[part], dict):
-            raise InputError(
-                f"--set {text}: {'.'.join(parts[: depth + 1])} has no keys in this run"
-            )
+    for part in parts[:-1]:
+        if not isinstance(table.get(part), dict):
+            raise InputError(f"--set {text}: there is no {part} in this run")
         table = table[part]
-
-
-def _usable(team: "Team | bytes", text: str) -> Team:
-    """The team if its settings can be used. Raises InputError with the first fault."""
-    data = team if isinstance(team, bytes) else msgspec.json.encode(team)
-    try:
-        return decode_resolved(data, f"--set {text}")
-    except TeamFileError as error:
-        raise InputError(one_line(str(error).splitlines()[0])) from error
+    table[parts[-1]] = value
 
 
 def _value(word: str) -> Any:

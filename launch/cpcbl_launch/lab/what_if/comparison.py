@@ -11,13 +11,23 @@ from statistics import fmean
 
 import msgspec
 import numpy as np
+from msgspec.structs import replace
+from numpy.typing import NDArray
 
 from cpcbl_launch.lab.seeds import HERE, Workers, run_seeds
 from cpcbl_launch.lab.what_if.changes import SENSORS, Change, sensed, with_change
 from cpcbl_launch.lab.what_if.inputs import RecordedInputs
 from cpcbl_launch.lab.what_if.rerun import Rerun, run_again
-from cpcbl_launch.reporting.metrics import Floats, Trajectory, interpolated_truth, seconds
-from cpcbl_launch.reporting.recorder import Report, RobotReport
+from cpcbl_launch.reporting.metrics import (
+    Floats,
+    Trajectory,
+    interpolated_truth,
+    samples_with_truth,
+    score,
+    seconds,
+    stated_sigma_m,
+)
+from cpcbl_launch.reporting.recorder import Report
 
 KINDS = {"fix": "collaboration.active=false", "belief": "collaboration.passive=false"}
 """The kinds of messages between robots, and what leaves each out."""
@@ -118,22 +128,27 @@ def what_if(
     reruns = dict(zip(changes, every, strict=True))
     again = reruns[Change()]
     changed = None if change is None else reruns[change]
-    common = again.paths if changed is None else changed.paths
-    value = _rmse_m if any(map(_rmse_m, again.report.robots.values())) else _sigma_m
+    common = tuple(again.paths if changed is None else changed.paths)
+    scored = {c: _scored(r, inputs.truth, inputs.paths) for c, r in reruns.items()}
+    known = any(figures.rmse_m is not None for figures in scored[Change()].values())
+    recorded = None
+    if inputs.report is not None:
+        as_recorded = Rerun(inputs.report, dict(inputs.paths), {})
+        recorded = _scored(as_recorded, inputs.truth, again.paths)
     return WhatIf(
         run=inputs.name,
         team=inputs.team.name,
         seconds=(inputs.end_ns - inputs.start_ns) * 1e-9,
         change=str(change or Change()),
-        basis=TRUTH if value is _rmse_m else STATED,
-        recorded=None if inputs.report is None else run_figures(inputs.report, common),
-        again=run_figures(again.report, common, again.paths, inputs.paths),
+        basis=TRUTH if known else STATED,
+        recorded=None if recorded is None else _run_figures(recorded, common, {}, {}),
+        again=_run_figures(scored[Change()], common, again.paths, inputs.paths),
         changed=None
-        if changed is None
-        else run_figures(changed.report, common, changed.paths, again.paths),
+        if changed is None or change is None
+        else _run_figures(scored[change], common, changed.paths, again.paths),
         control={} if changed is None else control(again, changed, inputs.start_ns * 1e-9),
         ledger=tuple(
-            _entry(*key, value, again.report, reruns[left_out or Change()].report)
+            _entry(*key, known, again.report, scored[Change()], scored[left_out or Change()])
             for key, left_out in entries.items()
         ),
         remarks=inputs.remarks,
@@ -143,52 +158,74 @@ def what_if(
 # Figures ------------------------------------------------------------------------------------------
 
 
-def run_figures(
-    report: Report,
-    robots: Collection[str],
-    paths: Mapping[str, Trajectory] = {},
-    other: Mapping[str, Trajectory] = {},
+def _scored(
+    run: Rerun, truth: Mapping[str, Floats], others: Mapping[str, Trajectory]
+) -> dict[str, RobotFigures]:
+    """The figures of each robot, at the times at which it has an estimate in another run, too: of
+    a process that was killed the last second is lost, and the first of the next is not recorded."""
+    found = {}
+    for name, report in run.report.robots.items():
+        path = run.paths.get(name)
+        if path is None:
+            continue
+        if name in others:
+            path = path.part(_near(path, others[name])[1])
+        figures, sigma_m = score(samples_with_truth(path, truth.get(name))[1]), stated_sigma_m(path)
+        found[name] = RobotFigures(
+            rmse_m=figures.position_rmse_m,
+            sigma_m=float(np.sqrt(np.mean(sigma_m**2))) if len(sigma_m) else None,
+            nees=figures.nees,
+            lost_share=report.lost_share,
+            messages_sent=report.messages_sent,
+            bytes_sent=report.bytes_sent,
+        )
+    return found
+
+
+def _run_figures(
+    scored: Mapping[str, RobotFigures],
+    common: Collection[str],
+    paths: Mapping[str, Trajectory],
+    others: Mapping[str, Trajectory],
 ) -> RunFigures:
-    """The figures of these robots, and how far they are from their estimates in another run."""
-    found = {
-        name: _robot_figures(report.robots[name], paths.get(name), other.get(name))
-        for name in robots
-        if name in report.robots
+    """The figures of these robots, with how far they are from their estimates in another run."""
+    robots = {
+        name: _with_distance(scored[name], paths.get(name), others.get(name))
+        for name in common
+        if name in scored
     }
-    chosen = [report.robots[name] for name in found]
     return RunFigures(
-        robots=found,
+        robots=robots,
         team=TeamFigures(
-            rmse_m=_mean(map(_rmse_m, chosen)),
-            sigma_m=_mean(map(_sigma_m, chosen)),
-            messages_sent=sum(r.messages_sent for r in chosen),
-            bytes_sent=sum(r.bytes_sent for r in chosen),
+            rmse_m=_mean(r.rmse_m for r in robots.values()),
+            sigma_m=_mean(r.sigma_m for r in robots.values()),
+            messages_sent=sum(r.messages_sent for r in robots.values()),
+            bytes_sent=sum(r.bytes_sent for r in robots.values()),
         ),
     )
 
 
-def _robot_figures(
-    report: RobotReport, path: Trajectory | None, other: Trajectory | None
+def _with_distance(
+    figures: RobotFigures, path: Trajectory | None, other: Trajectory | None
 ) -> RobotFigures:
     apart = np.empty(0) if path is None or other is None else distances_m(path, other)
-    return RobotFigures(
-        rmse_m=report.position_rmse_m,
-        sigma_m=report.sigma_rms_m,
-        nees=report.nees,
-        lost_share=report.lost_share,
-        messages_sent=report.messages_sent,
-        bytes_sent=report.bytes_sent,
-        apart_m=float(np.sqrt(np.mean(apart**2))) if len(apart) else None,
-        apart_most_m=float(apart.max()) if len(apart) else None,
-    )
+    if not len(apart):
+        return figures
+    root_mean_square = float(np.sqrt(np.mean(apart**2)))
+    return replace(figures, apart_m=root_mean_square, apart_most_m=float(apart.max()))
+
+
+def _near(path: Trajectory, other: Trajectory) -> tuple[Floats, NDArray[np.bool_]]:
+    """Where another trajectory is at the times of the first, and where that counts."""
+    rows = np.column_stack([seconds(other.stamps_ns), other.estimate])
+    if not len(rows):
+        return np.zeros_like(path.estimate), np.zeros(len(path.stamps_ns), dtype=bool)
+    return interpolated_truth(seconds(path.stamps_ns), rows)
 
 
 def distances_m(path: Trajectory, other: Trajectory) -> Floats:
     """The distances between two trajectories of one robot, at the times of the first."""
-    if not len(path.stamps_ns) or not len(other.stamps_ns):
-        return np.empty(0)
-    rows = np.column_stack([seconds(other.stamps_ns), other.estimate])
-    at, counts = interpolated_truth(seconds(path.stamps_ns), rows)
+    at, counts = _near(path, other)
     offset = path.estimate[counts, :2] - at[counts, :2]
     return np.asarray(np.hypot(*offset.T))
 
@@ -210,14 +247,6 @@ def control(again: Rerun, changed: Rerun, start_s: float) -> dict[str, Control]:
             first_s=float(after[np.argmax(different), 0]) - start_s if different.any() else None,
         )
     return found
-
-
-def _rmse_m(report: RobotReport) -> float | None:
-    return report.position_rmse_m
-
-
-def _sigma_m(report: RobotReport) -> float | None:
-    return report.sigma_rms_m
 
 
 def _mean(values: Iterable[float | None]) -> float | None:
@@ -252,18 +281,23 @@ def ledger_changes(inputs: RecordedInputs) -> dict[tuple[str, str], Change | Non
 def _entry(
     kind: str,
     name: str,
-    value: Callable[[RobotReport], float | None],
-    with_it: Report,
-    without_it: Report,
+    by_truth: bool,
+    report: Report,
+    with_it: Mapping[str, RobotFigures],
+    without_it: Mapping[str, RobotFigures],
 ) -> Entry:
     """What something was worth to the robots that are in both runs."""
-    pairs = [(value(with_it.robots[n]), value(r)) for n, r in without_it.robots.items()]
+
+    def value(figures: RobotFigures) -> float | None:
+        return figures.rmse_m if by_truth else figures.sigma_m
+
+    pairs = [(value(with_it[n]), value(r)) for n, r in without_it.items() if n in with_it]
     known = [(a, b) for a, b in pairs if a is not None and b is not None]
     with_m, without_m = _mean(a for a, _ in known), _mean(b for _, b in known)
     worth_m = None if with_m is None or without_m is None else without_m - with_m
     sent = 0
     if kind == "message":
-        flows = (flow for r in with_it.robots.values() for flow in r.sent)
+        flows = (flow for r in report.robots.values() for flow in r.sent)
         sent = sum(flow.bytes for flow in flows if flow.topic == name)
     return Entry(
         kind=kind,

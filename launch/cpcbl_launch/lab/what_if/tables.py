@@ -8,7 +8,7 @@ from rich.console import RenderableType
 from cpcbl_launch.lab.what_if.comparison import STATED, RobotFigures, TeamFigures, WhatIf
 from cpcbl_launch.reporting.tables import cells, number, table
 
-FAR_M = 0.05  # a run that is made again is expected within this distance of the recorded one
+FAR = 0.5  # of a robot's error: a run that is made again is expected nearer to the recorded one
 
 
 def tables(result: WhatIf) -> Iterable[RenderableType]:
@@ -65,16 +65,27 @@ def remarks(result: WhatIf) -> Iterable[str]:
     if result.recorded is None:
         yield "A log has no estimates of its own: `again` is the team on the log as it is."
     else:
-        apart = [r.apart_m for r in result.again.robots.values() if r.apart_m is not None]
-        if apart:
-            yield (
-                f"Made again with nothing changed, the estimates are {max(apart):.4f} m from the"
-                " recorded ones (the robot that is farthest, root mean square): the delays of the"
-                " real bus are not in it."
-            )
-            if max(apart) > FAR_M:
-                yield f"That is more than {FAR_M:g} m: what-if says little about this run."
+        yield from _apart(result)
     yield from _control(result)
+
+
+def _apart(result: WhatIf) -> Iterable[str]:
+    """How well the run could be made again."""
+    known = [(r.apart_m, name) for name, r in result.again.robots.items() if r.apart_m is not None]
+    if not known:
+        yield "The recording has no estimates, so nobody knows how well the run was made again."
+        return
+    apart_m, name = max(known)
+    yield (
+        f"Made again with nothing changed, the estimates of {name} are {apart_m:.4f} m from the"
+        " recorded ones (root mean square), of the others less: the delays of the real bus are not"
+        " in it."
+    )
+    for robot, figures in result.again.robots.items():
+        own_m = figures.rmse_m if figures.rmse_m is not None else figures.sigma_m
+        if figures.apart_m is not None and own_m is not None and figures.apart_m > FAR * own_m:
+            share = f"more than {FAR:.0%} of its error"
+            yield f"Of {robot} that is {share}: what-if says little about it."
 
 
 def _control(result: WhatIf) -> Iterable[str]:

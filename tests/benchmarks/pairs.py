@@ -1,4 +1,4 @@
-"""`make bench-what-if`: what-if beside the truth over many pairs, as a table for the docs.
+"""`make bench-pairs`: what-if beside the truth over many pairs, as a table for the docs.
 
 Each pair is a simulated run that is recorded, and the same run really made with a change. Robots
 drive as commanded beforehand (open loop), with messages that arrive at once or some time later, or
