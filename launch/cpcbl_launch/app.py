@@ -30,6 +30,7 @@ COMMANDS = {
     "compose": "preparing.compose",
     "simulate": "measuring.simulate",
     "evaluate": "measuring.evaluate",
+    "replay": "replaying.replay",
     "chaos": "measuring.chaos",
     "list": "diagnosing.list_teams",
     "robot": "",  # it has a parser of its own
