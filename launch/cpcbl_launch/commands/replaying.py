@@ -27,7 +27,7 @@ Whom = Annotated[
     Option(
         "--robot",
         metavar="ROBOT[/INCARNATION]",
-        help="Replay this robot, or this process of it, alone.",
+        help="Replay this robot alone, or this process of it.",
     ),
 ]
 Until = Annotated[
