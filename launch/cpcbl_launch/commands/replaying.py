@@ -19,9 +19,7 @@ if TYPE_CHECKING:
     from cpcbl_launch.recordings.read import Run
     from cpcbl_launch.recordings.replay import RunReplayed
 
-RecordedRun = Annotated[
-    Path, Argument(metavar="RUN", help="Folder of a run: `up --record FOLDER`.")
-]
+RecordedRun = Annotated[Path, Argument(metavar="RUN", help="Folder of a run (up --record).")]
 Whom = Annotated[
     list[str] | None,
     Option(
@@ -32,7 +30,11 @@ Whom = Annotated[
 ]
 Until = Annotated[
     float,
-    Option(callback=options.duration, help="Seconds after the start of each process to end at."),
+    Option(
+        callback=options.duration,
+        show_default=False,
+        help="Seconds after the start of each process to end at; default: its end.",
+    ),
 ]
 Speed = Annotated[
     float | None, Option(help="Times real time; default: as fast as the machine is; with --view 1.")
@@ -106,7 +108,7 @@ def _page(run: "Run", listen: str | None, open_page: bool, console: Console) -> 
     from cpcbl_launch.views.web.server import ShownTeam, serve
     from cpcbl_launch.views.web.view import address_lines
     from cpcbl_transport.memory_bus import MemoryHub
-    from cpcbl_transport.topics import Qos
+    from cpcbl_transport.topics import ALIVE, Qos
 
     hub = MemoryHub()
     bus = hub.session()
@@ -117,17 +119,19 @@ def _page(run: "Run", listen: str | None, open_page: bool, console: Console) -> 
             console.print(line, highlight=False, soft_wrap=True)
         if open_page:
             typer.launch(address)
+        for name in run.processes:
+            bus.declare_token(ALIVE.at(tier=0, robot=name, incarnation="replay"))
         with feed.attach(hub.session()):
             yield lambda key, payload: bus.publisher(key, Qos.TELEMETRY).put(payload)
 
 
 def _print(result: "RunReplayed") -> None:
     """Prints a line for each process, and one for each thing that could not be read."""
+    for version in {p.version for p in result.processes} - {result.version}:
+        typer.echo(f"recorded by version {version}, replayed by {result.version}")
     for process in result.processes:
         name = f"{process.robot} ({process.incarnation})"
         counted = f"{process.steps} steps, {process.messages} messages, {process.seconds:.1f} s"
-        if process.version != result.version:
-            typer.echo(f"{name}: recorded by {process.version}, replayed by {result.version}")
         if process.difference is None:
             typer.echo(f"{name}: equal to the bit: {counted}")
         else:

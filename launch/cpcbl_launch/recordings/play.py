@@ -1,4 +1,4 @@
-"""Replays all processes of a run together, in the order of their steps, at a pace that people see."""
+"""Replays all processes of a run together, in the order of their steps, at a given speed."""
 
 import time
 from collections.abc import Callable, Sequence

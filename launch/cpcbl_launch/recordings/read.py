@@ -80,9 +80,8 @@ class Run(NamedTuple):
         every = [process for of_robot in self.processes.values() for process in of_robot]
         known = {p.robot for p in every} | {f"{p.robot}/{p.header.incarnation}" for p in every}
         if unknown := sorted(set(names) - known):
-            raise LogError(
-                f"{self.folder}: no robot {', '.join(unknown)}; there are {', '.join(sorted(known))}"
-            )
+            there = ", ".join(sorted(known))
+            raise LogError(f"{self.folder}: no robot {', '.join(unknown)}; there are {there}")
         chosen = {p.robot for p in every} if not names else set(names)
         return [p for p in every if {p.robot, f"{p.robot}/{p.header.incarnation}"} & chosen]
 
