@@ -28,7 +28,7 @@ def simulate(
     seed: int,
     duration_s: float,
     truth: Team | None = None,
-    watch: Callable[[Bus], None] = lambda bus: None,
+    watch: Callable[[Bus], object] = lambda bus: None,
     over: Callable[[], bool] = lambda: False,
     progress: Progress | None = None,
     bus_wrappers: Mapping[str, BusWrapper] = MappingProxyType({}),
@@ -44,9 +44,8 @@ def simulate(
     recorder = Recorder(hub.session())
     watch(hub.session())
     field = FieldNode(SimulatedField(truth or team, seed, 0), hub.session())
-    run_nodes(
-        [field, *robot_nodes(team, hub, 0, bus_wrappers, tape_for)], 0, end_ns, progress, over
-    )
+    robots = robot_nodes(team, hub, 0, bus_wrappers, tape_for)
+    run_nodes([field, *robots], 0, end_ns, progress, over)
     return simulated_report(recorder, team), recorder
 
 
