@@ -32,6 +32,7 @@ COMMANDS = {
     "merge": "recorded.merge",
     "report": "recorded.report",
     "evaluate": "measuring.evaluate",
+    "replay": "replaying.replay",
     "what-if": "what_if.what_if",
     "chaos": "measuring.chaos",
     "list": "diagnosing.list_teams",

@@ -170,6 +170,11 @@ WAYS = {
     "cpcbl-team router team.toml --listen tcp/0.0.0.0:7447 --print-config > router.json5": Way(
         "zenohd -c FILE"
     ),
+    "cpcbl-team replay run": Way(
+        ": equal to the bit: ", first="cpcbl-team simulate demo --duration 3 --record run"
+    ),
+    "cpcbl-team robot team.toml r1 --record run": LIVE,
+    "cpcbl-team simulate demo --duration 20 --record run": Way(SIMULATED, "trial"),
     "cpcbl-team simulate demo --picture docs/demo.png": Way(SIMULATED, "trial", SHORT),
     "cpcbl-team traffic demo --connect tcp/127.0.0.1:32885": Way(
         "status/", "trial", "--duration 3", beside="demo", shows=("team demo at",)

@@ -20,11 +20,12 @@ from cpcbl_agents.flight_recorder.entries import (
     TokenTaken,
     Undeclared,
 )
-from cpcbl_agents.flight_recorder.images import without_image
+from cpcbl_agents.flight_recorder.images import CARRIES_IMAGES, without_image
 from cpcbl_agents.flight_recorder.segments import SegmentWriter
 from cpcbl_agents.flight_recorder.states import encode_state
 from cpcbl_agents.sources import OwnCamera, Picture, Source
 from cpcbl_agents.tape import SourceT, Tape
+from cpcbl_team.inputs import MarkerSighting
 from cpcbl_transport import topics
 from cpcbl_transport.bus import (
     Bus,
@@ -116,7 +117,9 @@ class FlightRecorder(Tape):
 
     def without_image(self, key: str, payload: bytes) -> bytes:
         """A payload as it is noted: images only if they are kept."""
-        return payload if self._keeps_images else without_image(key, payload)
+        if self._keeps_images or not key.startswith(CARRIES_IMAGES):
+            return payload
+        return without_image(key, payload)
 
     def wrap_bus(self, bus: Bus) -> Bus:
         return _RecordedBus(bus, self)
@@ -163,18 +166,20 @@ class _RecordedArrivals(Arrivals):
         return token
 
     def take_message(self) -> tuple[str, bytes]:
-        key, payload = super().take_message()
-        self._recorder.note(MessageTaken(key, payload), len(payload))
-        return key, payload
+        message = self._inbox.take()
+        self._recorder.note(MessageTaken(*message), len(message[1]))
+        return message
 
     def take_frame(self) -> tuple[str, bytes] | None:
-        if (frame := super().take_frame()) is not None:
-            key, payload = frame[0], self._recorder.without_image(*frame)[: LARGEST_FRAME + 1]
-            self._recorder.note(FrameTaken(key, payload), len(payload))
+        if not self._frames:
+            return None
+        frame = self._frames.popleft()
+        payload = self._recorder.without_image(*frame)[: LARGEST_FRAME + 1]
+        self._recorder.note(FrameTaken(frame[0], payload), len(payload))
         return frame
 
     def note_taken(self, taken: int, waiting: int) -> None:
-        super().note_taken(taken, waiting)
+        self._inbox.is_fair = taken < waiting
         if taken < waiting:
             self._recorder.note_waiting(waiting)
 
@@ -227,11 +232,15 @@ class _RecordedPublisher(PublisherProxy):
     def __init__(self, publisher: Publisher, key: str, recorder: FlightRecorder) -> None:
         super().__init__(publisher)
         self._key, self._recorder = key, recorder
+        self._answer: bool | None = None
         self.restored_as = ("publisher", key)
 
     @property
     def matching(self) -> bool:
-        return self._recorder.answer(self._key, self._publisher.matching)
+        answer = self._publisher.matching
+        if answer is not self._answer:  # the question that is asked most often
+            self._answer = self._recorder.answer(self._key, answer)
+        return answer
 
     def put(self, payload: bytes) -> None:
         payload_noted = self._recorder.without_image(self._key, payload)
@@ -319,12 +328,19 @@ class _RecordedDetection(Detection):
     def collect(self) -> Sequence[DetectedFrame]:
         results = self._detection.collect()
         for stamp_ns, sightings, annotated in results:
-            found = b"" if isinstance(sightings, str) else encode(sightings)
-            reason = sightings if isinstance(sightings, str) else ""
+            found, reason, per_focal = b"", "", tuple[float | None, ...]()
+            if isinstance(sightings, str):
+                reason = sightings
+            else:
+                found = encode(sightings)
+                per_focal = tuple(
+                    s.heading_per_focal if isinstance(s, MarkerSighting) else None
+                    for s in sightings.sightings
+                )
             shown = None
             if annotated is not None:
                 key = topics.LOOK.at(robot=annotated.robot)
                 shown = self._recorder.without_image(key, encode(annotated))
             size = len(found) + len(shown or b"")
-            self._recorder.note(Detected(stamp_ns, found, reason, shown), size)
+            self._recorder.note(Detected(stamp_ns, found, reason, per_focal, shown), size)
         return results

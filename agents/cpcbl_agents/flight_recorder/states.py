@@ -1,6 +1,7 @@
 """The whole state of a node as bytes, and back: safe to read from strangers, exact to the bit.
 
 Objects form a table, and refer to each other by their number, so that what two share stays shared.
+Constants of modules stay what they are, for the filter asks whether something is one of them.
 Only the classes of the agents and of the core are made again, and no constructor of theirs runs.
 What belongs to the world (bus, arrivals, sources) is named, and whoever restores the state has it.
 """
@@ -30,7 +31,18 @@ _CONTAINERS: dict[type[Any], str] = {
 }
 _KINDS = (
     *_CONTAINERS.values(),
-    *("array", "definition", "enum", "int", "method", "named", "object", "outside", "struct"),
+    *(
+        "array",
+        "constant",
+        "definition",
+        "enum",
+        "int",
+        "method",
+        "named",
+        "object",
+        "outside",
+        "struct",
+    ),
 )
 _MODULES = (
     "cpcbl_team.",
@@ -74,6 +86,7 @@ class _Encoder:
     def __init__(self) -> None:
         self._table: list[list[Any]] = []
         self._numbers: dict[int, int] = {}
+        self._constants = {id(value): name for name, value in _constants()}
         self._kept: list[object] = []  # so that no other object gets their ids
 
     def table(self, root: object) -> list[list[Any]]:
@@ -95,7 +108,9 @@ class _Encoder:
 
     def _row(self, value: Any, kind: type[Any]) -> Iterator[Any]:
         outside = getattr(value, OUTSIDE, None)
-        if outside is not None and not isinstance(value, type):
+        if id(value) in self._constants:
+            yield from ("constant", self._constants[id(value)])
+        elif outside is not None and not isinstance(value, type):
             yield from ("outside", *outside)
         elif kind in _CONTAINERS:
             yield _CONTAINERS[kind]
@@ -124,6 +139,18 @@ class _Encoder:
             yield from ("object", _name(kind), *(part for pair in names for part in pair))
 
 
+def _constants() -> Iterator[tuple[str, Any]]:
+    """The constants of the modules whose objects may be restored, with their names."""
+    for module in [name for name in sys.modules if _is_allowed(name)]:
+        for name, value in vars(sys.modules[module]).items():
+            if name.isupper() and not isinstance(value, _PLAIN):
+                yield f"{module}:{name}", value
+
+
+def _is_allowed(module: str) -> bool:
+    return any(module.startswith(m) if m.endswith(".") else module == m for m in _MODULES)
+
+
 def _is_mapping(kind: type[Any]) -> bool:
     return kind in (dict, Counter, types.MappingProxyType)
 
@@ -147,8 +174,7 @@ def _name(definition: Any) -> str:
 def _find(name: str) -> Any:
     """The class or function of this name. Raises StateError for one that no state may name."""
     module, _, qualified = name.partition(":")
-    is_allowed = any(module.startswith(m) if m.endswith(".") else module == m for m in _MODULES)
-    if not is_allowed or not qualified.isidentifier():
+    if not _is_allowed(module) or not qualified.isidentifier():
         raise StateError(f"names {name}")
     if module not in sys.modules and "vision" not in module:
         raise StateError(f"names {name}, which this robot does not use")
@@ -258,6 +284,12 @@ class _Decoder:
         if not callable(method):
             raise StateError(f"{name} is no method")
         return method
+
+    def _constant(self, number: int, name: str) -> Any:
+        module, _, constant = name.partition(":")
+        if not (_is_allowed(module) and module in sys.modules and constant.isupper()):
+            raise StateError(f"names {name}")
+        return getattr(sys.modules[module], constant)
 
     def _definition(self, number: int, name: str) -> Any:
         return _find(name)

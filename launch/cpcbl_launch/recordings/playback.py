@@ -7,6 +7,8 @@ from collections import Counter
 from collections.abc import Callable, Collection, Sequence
 from typing import Any, TypeVar, cast
 
+from msgspec.structs import asdict, replace
+
 from cpcbl_agents.arrivals import Arrivals
 from cpcbl_agents.detection_worker import DetectedFrame, Detection
 from cpcbl_agents.flight_recorder.entries import (
@@ -23,12 +25,13 @@ from cpcbl_agents.flight_recorder.entries import (
     TokenTaken,
     Undeclared,
 )
+from cpcbl_agents.flight_recorder.images import CARRIES_IMAGES, without_image
 from cpcbl_agents.flight_recorder.states import StateError, decode_state, encode_state
 from cpcbl_agents.node import NO_CALLBACKS
 from cpcbl_agents.sources import OwnCamera
 from cpcbl_agents.tape import SourceT, Tape
 from cpcbl_launch.recordings.differences import DifferenceError
-from cpcbl_team.inputs import Sightings
+from cpcbl_team.inputs import MarkerSighting, Sightings
 from cpcbl_transport.bus import Bus, Handle, LivelinessCallback, MessageCallback, Publisher
 from cpcbl_transport.messages import LARGEST_FRAME, AnnotatedFrame, decode_tagged
 from cpcbl_transport.topics import Qos
@@ -54,7 +57,7 @@ class Playback(Tape):
         self._on_put = on_put
         self._step, self._next = Step(0, ()), 0
         self._answers: dict[str, Any] = {}
-        self._input: AnyEntry | None = None
+        self.input: AnyEntry | None = None  # the one that was taken last in this step
         self._handled = 0
         self.waiting_tokens = self.waiting_messages = 0
         self.messages = 0
@@ -62,7 +65,7 @@ class Playback(Tape):
 
     def load(self, step: Step) -> None:
         """The step that comes next."""
-        self._step, self._next, self._input = step, 0, None
+        self._step, self._next, self.input = step, 0, None
         self.waiting_tokens = sum(isinstance(e, TokenTaken) for e in step.entries)
         taken = sum(isinstance(e, MessageTaken) for e in step.entries)
         self.waiting_messages = taken if step.waiting < 0 else step.waiting
@@ -73,8 +76,8 @@ class Playback(Tape):
         return handled < self._handled
 
     def end(self) -> None:
-        if self._upcoming is not None:
-            raise DifferenceError(self._input, self._upcoming, None)
+        if self._upcoming is not None or not self._step.is_whole:
+            raise DifferenceError(self.input, self._upcoming, None)
 
     @property
     def _upcoming(self) -> AnyEntry | None:
@@ -87,14 +90,14 @@ class Playback(Tape):
         if not isinstance(entry, kind) or (isinstance(entry, Polled) and entry.source != name):
             return None
         self._next += 1
-        self._input = cast(AnyEntry, entry)
+        self.input = cast(AnyEntry, entry)
         return entry
 
     def take(self, kind: type[EntryT]) -> EntryT:
         """The same where there must be one."""
         entry = self.find(kind)
         if entry is None:  # the node did something else before
-            raise DifferenceError(self._input, self._upcoming, None)
+            raise DifferenceError(self.input, self._upcoming, None)
         return entry
 
     def answer(self, question: str) -> Any:
@@ -147,12 +150,15 @@ class Playback(Tape):
         """The node does this; it must have done it."""
         old = self._upcoming
         if old != entry:
-            raise DifferenceError(self._input, old, entry)
+            raise DifferenceError(self.input, old, entry)
         self._next += 1
 
     def put(self, key: str, payload: bytes) -> None:
         """The node puts this on the bus."""
-        self.compare(Put(key, payload))
+        entry = Put(key, payload)
+        if key.startswith(CARRIES_IMAGES) and entry != self._upcoming:
+            entry = Put(key, without_image(key, payload))  # as it was noted
+        self.compare(entry)
         self.messages += 1
         self._on_put(key, payload)
 
@@ -336,11 +342,23 @@ class _PlayedDetection(Detection):
     def collect(self) -> Sequence[DetectedFrame]:
         results = []
         while (found := self._playback.find(Detected)) is not None:
-            sightings = decode_tagged(found.sightings) if found.sightings else found.reason
+            sightings = _sightings_of(found) if found.sightings else found.reason
             shown = None
             if found.annotated is not None:
                 shown = decode_tagged(found.annotated, LARGEST_FRAME)
-            assert isinstance(sightings, Sightings | str)
+            if not isinstance(sightings, str) and isinstance(shown, AnnotatedFrame):
+                shown = replace(shown, found=sightings.sightings)
             assert shown is None or isinstance(shown, AnnotatedFrame)
             results.append(DetectedFrame(found.stamp_ns, sightings, shown))
         return results
+
+
+def _sightings_of(found: Detected) -> Sightings:
+    """The sightings in a frame as the detector made them."""
+    frame = decode_tagged(found.sightings)
+    assert isinstance(frame, Sightings)
+    sightings = (
+        sighting if k is None else MarkerSighting(**asdict(sighting), heading_per_focal=k)
+        for sighting, k in zip(frame.sightings, found.per_focal, strict=True)
+    )
+    return Sightings(frame.stamp_ns, tuple(sightings))
