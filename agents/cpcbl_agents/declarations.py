@@ -47,10 +47,10 @@ class Declarations:
             self._publishers[key] = self._bus.publisher(key, topic.qos)
         return self._publishers[key]
 
-    def update(self, interests: Interests | None) -> frozenset[str]:
+    def update(self, interests: Interests | None) -> list[str]:
         """Declares what is of interest now. Returns the teammates that are no longer watched."""
         if interests is None:
-            return frozenset()
+            return []
         tier, neighbours, sources = interests
         is_new_tier, old_token = tier != self.tier, self._token
         if is_new_tier:
@@ -63,7 +63,7 @@ class Declarations:
             subscribe = self._bus.subscribe
             keys = self._subscribed_keys(tier)
             _declare(self._subscriptions, keys, lambda k: subscribe(k, self._on_message))
-        forgotten = self._neighbours - neighbours
+        forgotten = sorted(self._neighbours - neighbours)
         if neighbours != self._neighbours:
             self._neighbours = neighbours
             tokens = (topics.ALIVE.at(robot=name) for name in neighbours)
@@ -93,10 +93,11 @@ class Declarations:
 def _declare(
     declared: dict[str, Handle], wanted: Iterable[str], declare: Callable[[str], Handle]
 ) -> None:
+    # Sorted: a set of texts has another order in each process
     keys = set(wanted)
-    for key in keys - declared.keys():
+    for key in sorted(keys - declared.keys()):
         declared[key] = declare(key)
-    for key in declared.keys() - keys:
+    for key in sorted(declared.keys() - keys):
         declared.pop(key).close()
 
 

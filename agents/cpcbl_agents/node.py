@@ -79,6 +79,11 @@ class NodeCallbacks(NamedTuple):
     on_arrival: Callable[[], None] = lambda: None  # called on a thread of the bus
     on_status: Callable[[Status], None] = lambda status: None  # called once a second
 
+    @property
+    def restored_as(self) -> tuple[str]:
+        """They are no part of a node's state."""
+        return ("callbacks",)
+
 
 NO_CALLBACKS = NodeCallbacks()
 
@@ -101,7 +106,7 @@ class Node:
         self._callbacks, self._status_ns, self._tape = callbacks, start_ns, tape
         rules = team.robots[robot.name].collaboration
         self._team, self._passive = frozenset(team.robots), rules.passive
-        tape.begin(start_ns)
+        tape.start(self, start_ns)
         self._bus = bus = tape.wrap_bus(bus)
         named = robot.name, incarnation, self._team
         self.arrivals, self._load = tape.arrivals(*named, callbacks.on_arrival), LoadMonitor(speed)

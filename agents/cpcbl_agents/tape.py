@@ -21,6 +21,10 @@ class Tape:
     A recorder notes what passes; a replay answers in place of the world, and compares what comes.
     """
 
+    def start(self, node: object, now_ns: int) -> None:
+        """This node begins with its first step, in which it is made."""
+        self.begin(now_ns)
+
     def begin(self, now_ns: int, leaves: bool = False) -> None:
         """A step of the node begins. `leaves`: the last one, of a guest that leaves."""
 

@@ -120,6 +120,7 @@ class Header(msgspec.Struct, frozen=True, kw_only=True):
     robot: str
     incarnation: str
     segment: int  # the number of the file, from 0
+    first_step: int = 0  # the number of its first step
     version: str  # of this program, and a digest of its sources
     python: str
     platform: str
@@ -132,6 +133,7 @@ class Header(msgspec.Struct, frozen=True, kw_only=True):
     is_pose_given: bool
     restarted: bool
     has_camera: bool  # of its own
+    state: bytes = b""  # of the node where this file begins (`states`), unless it is the first one
     began_unix_s: float  # when this file began, by the machine's clock; for people
 
 

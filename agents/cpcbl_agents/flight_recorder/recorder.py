@@ -1,5 +1,6 @@
 """The tape that notes what passes between a node and the world. It declares nothing on the bus."""
 
+import logging
 from collections import Counter
 from collections.abc import Callable, Collection, Sequence
 from typing import Any, TypeVar
@@ -21,6 +22,7 @@ from cpcbl_agents.flight_recorder.entries import (
 )
 from cpcbl_agents.flight_recorder.images import without_image
 from cpcbl_agents.flight_recorder.segments import SegmentWriter
+from cpcbl_agents.flight_recorder.states import encode_state
 from cpcbl_agents.sources import OwnCamera, Picture, Source
 from cpcbl_agents.tape import SourceT, Tape
 from cpcbl_transport import topics
@@ -36,6 +38,8 @@ from cpcbl_transport.bus import (
 from cpcbl_transport.messages import LARGEST_FRAME, Frame, encode
 from cpcbl_transport.topics import Qos
 
+log = logging.getLogger(__name__)
+
 AnswerT = TypeVar("AnswerT")
 ENTRY_BYTES = 100  # that an entry takes in memory beside its payload
 
@@ -43,12 +47,19 @@ ENTRY_BYTES = 100  # that an entry takes in memory beside its payload
 class FlightRecorder(Tape):
     """Notes the steps of one node, and hands each over to be written when it is over."""
 
+    restored_as = ("tape",)
+
     def __init__(self, writer: SegmentWriter, keeps_images: bool = False) -> None:
         self._writer, self._keeps_images = writer, keeps_images
+        self._node: object = None
         self._answers: dict[str, Any] = {}
         self._entries: list[AnyEntry] = []
         self._now_ns, self._waiting, self._size = 0, -1, 0
         self._is_within_step = self._leaves = False
+
+    def start(self, node: object, now_ns: int) -> None:
+        self._node = node
+        self.begin(now_ns)
 
     def begin(self, now_ns: int, leaves: bool = False) -> None:
         self._now_ns, self._leaves, self._is_within_step = now_ns, leaves, True
@@ -61,6 +72,16 @@ class FlightRecorder(Tape):
         self._writer.add(step, self._size + ENTRY_BYTES * (1 + len(self._entries)))
         self._entries.clear()
         self._waiting, self._size, self._is_within_step = -1, 0, False
+        if self._writer.wants_state:
+            self._writer.add_state(self._state())
+
+    def _state(self) -> bytes:
+        """With it the next file can be replayed without the ones before it."""
+        try:
+            return encode_state([self._node, self._answers])
+        except Exception:  # an error of this program, which must not end the robot
+            log.exception("%s: its state is not recorded", self)
+            return b""
 
     def close(self) -> None:
         """Writes what is left; also the step that an exception ended."""
@@ -115,6 +136,8 @@ class FlightRecorder(Tape):
 class _RecordedArrivals(Arrivals):
     """Notes what is taken, when it is taken."""
 
+    restored_as = ("arrivals",)
+
     def __init__(
         self,
         recorder: FlightRecorder,
@@ -164,6 +187,8 @@ class _RecordedArrivals(Arrivals):
 class _RecordedBus(BusProxy):
     """Notes what is declared and put, and the answers of publishers."""
 
+    restored_as = ("bus",)
+
     def __init__(self, bus: Bus, recorder: FlightRecorder) -> None:
         super().__init__(bus)
         self._recorder = recorder
@@ -191,6 +216,7 @@ class _RecordedBus(BusProxy):
 class _RecordedHandle(Handle):
     def __init__(self, handle: Handle, undeclared: Undeclared, recorder: FlightRecorder) -> None:
         self._handle, self._undeclared, self._recorder = handle, undeclared, recorder
+        self.restored_as = ("handle", undeclared.what, undeclared.key)
 
     def close(self) -> None:
         self._recorder.note(self._undeclared)
@@ -201,6 +227,7 @@ class _RecordedPublisher(PublisherProxy):
     def __init__(self, publisher: Publisher, key: str, recorder: FlightRecorder) -> None:
         super().__init__(publisher)
         self._key, self._recorder = key, recorder
+        self.restored_as = ("publisher", key)
 
     @property
     def matching(self) -> bool:
@@ -241,6 +268,10 @@ class _RecordedSource(OwnCamera):
         return payload
 
     @property
+    def restored_as(self) -> tuple[str, str, int | None, bool]:
+        return "source", self._name, self.next_ns, self.is_finished
+
+    @property
     def next_ns(self) -> int | None:
         return self._source.next_ns
 
@@ -264,6 +295,8 @@ class _RecordedSource(OwnCamera):
 
 class _RecordedDetection(Detection):
     """Notes what was found in frames, when the node takes it."""
+
+    restored_as = ("detection",)
 
     def __init__(self, detection: Detection, recorder: FlightRecorder) -> None:
         self._detection, self._recorder = detection, recorder

@@ -31,10 +31,13 @@ class SegmentWriter:
     def __init__(self, folder: Path, header: Header, rules: RecordingSettings) -> None:
         self._folder, self._header, self._rules = folder / header.robot, header, rules
         self.problem = ""
-        self._steps: deque[tuple[Step, int]] = deque()
+        self.wants_state = False
+        """Whether the next file is due: it begins with the node's state after the latest step."""
+        self._steps: deque[tuple[Step | bytes, int]] = deque()
+        self._number = 0  # of the next step
         self._added = self._written = 0  # bytes in memory; each is changed by one thread
         self._begun_s = self._synced_s = time.monotonic()
-        self._is_synced = False
+        self._is_synced = self._is_next_due = False
         self._stop = threading.Event()
         self._folder.mkdir(parents=True, exist_ok=True)
         self._file = self._begin_file()
@@ -50,6 +53,12 @@ class SegmentWriter:
             return
         self._added += size
         self._steps.append((step, size))
+
+    def add_state(self, state: bytes) -> None:
+        """The state that the next file begins with; to be called once where it is wanted."""
+        self.wants_state = False
+        self._added += len(state)
+        self._steps.append((state, len(state)))
 
     def close(self) -> None:
         """Writes what is left."""
@@ -78,22 +87,39 @@ class SegmentWriter:
                 self._file.close()
 
     def _write(self) -> None:
-        taken = [self._steps.popleft() for _ in range(len(self._steps))]
+        steps: list[Step] = []
+        for _ in range(len(self._steps)):
+            item, size = self._steps.popleft()
+            self._written += size
+            if isinstance(item, Step):
+                steps.append(item)
+            else:
+                self._write_steps(steps)
+                steps = []
+                self._begin_next_file(item)
+        self._write_steps(steps)
         now_s = time.monotonic()
-        if taken:
-            self._file.write(steps_block([step for step, _ in taken]))
-            self._file.flush()
-            self._written += sum(size for _, size in taken)
-            self._is_synced = False
         if not self._is_synced and (self._stop.is_set() or now_s - self._synced_s >= SYNC_S):
             os.fsync(self._file.fileno())
             self._synced_s, self._is_synced = now_s, True
         is_large = self._file.tell() >= self._rules.segment_bytes
-        if is_large or now_s - self._begun_s >= self._rules.segment_s:
-            self._file.close()
-            self._header = replace(self._header, segment=self._header.segment + 1)
-            self._file = self._begin_file()
-            self._delete_oldest()
+        if not self._is_next_due and (is_large or now_s - self._begun_s >= self._rules.segment_s):
+            self._is_next_due = self.wants_state = True
+
+    def _write_steps(self, steps: list[Step]) -> None:
+        self._number += len(steps)
+        if steps:
+            self._file.write(steps_block(steps))
+            self._file.flush()
+            self._is_synced = False
+
+    def _begin_next_file(self, state: bytes) -> None:
+        os.fsync(self._file.fileno())
+        self._file.close()
+        number = self._header.segment + 1
+        self._header = replace(self._header, segment=number, first_step=self._number, state=state)
+        self._file, self._is_next_due = self._begin_file(), False
+        self._delete_oldest()
 
     def _begin_file(self) -> BinaryIO:
         name = f"{self._header.incarnation}-{self._header.segment:04}{SUFFIX}"

@@ -29,6 +29,8 @@ T = TypeVar("T")
 class CameraDetector:
     """The detector of one robot of a team."""
 
+    restored_as = ("detector",)  # what it found is in a recording, so it is no part of a state
+
     def __init__(self, robot: str, team: Team) -> None:
         self.robot, self.camera = robot, Camera(team.robots[robot].camera)
         self._frame_s = 1.0 / team.robots[robot].sensor.rate_hz

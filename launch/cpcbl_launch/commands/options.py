@@ -40,6 +40,14 @@ def _require_writable(option: str, path: Path, existing: Path) -> None:
         raise InputError(f"{option} {path}: {existing} cannot be written; name another place")
 
 
+def _require_recording(option: str, path: Path) -> None:
+    """A file of a recording, or a folder for one."""
+    if path.suffix == ".mcap":
+        require_writable_file(option, path)
+    else:
+        require_folder(option, path)
+
+
 def _require_picture(option: str, path: Path) -> None:
     require_writable_file(option, path)
     require_matplotlib(option, path)
@@ -72,6 +80,7 @@ writable_file, writable_picture = (
     check_callback(_require_picture),
 )
 folder, endpoints = check_callback(require_folder), check_callback(require_endpoints)
+recording = check_callback(_require_recording)
 duration = check_callback(_require_time)
 
 

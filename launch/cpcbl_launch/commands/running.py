@@ -2,6 +2,7 @@
 
 import json
 import shlex
+import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from functools import partial
@@ -47,11 +48,12 @@ Speed = Annotated[
     Option(callback=options.check_callback(_require_speed), help="Times real time, at least 0.05."),
 ]
 Robots = Annotated[str, Option(help="Robots to start on this machine; default: all.")]
-RecordFile = Annotated[
+RecordPath = Annotated[
     Path | None,
     Option(
-        callback=options.writable_file,
-        help="File to record inputs, tracks, images, status and truth into (MCAP).",
+        callback=options.recording,
+        help="Folder to record the whole run into, to have it again with `replay`; or a file (MCAP)"
+        " for inputs, tracks, images, status and truth.",
     ),
 ]
 ProcessLogs = Annotated[
@@ -81,7 +83,7 @@ def up(
     match_messages: options.MatchMessages = None,
     report: options.ReportFile = None,
     picture: options.PictureFile = None,
-    record: RecordFile = None,
+    record: RecordPath = None,
     logs: ProcessLogs = None,
     containers: InContainersOption = False,
     image: options.Image = None,
@@ -99,7 +101,8 @@ def up(
 
     budgets = Overrides(bytes_per_s, messages_per_minute, match_messages)
     run = _run_of(file, duration, data, budgets)
-    run = run._replace(speed=speed, seed=seed, folder=logs, picture=picture, record=record)
+    run = run._replace(speed=speed, seed=seed, folder=logs, picture=picture)
+    run = run._replace(record=record or _own_recording(run.team))
     blind_team = with_blind_robots(run.team, options.parse_names(blind), run.left_out)
     run = run._replace(team=blind_team, connect=tuple(connect or ()))
     if robots:
@@ -116,6 +119,12 @@ def up(
     options.print_result(result, as_json, lambda: print_report(result, console), lost)
     if not result.has_data and not StopSignal.was_interrupted:
         _fail_without_data(run)
+
+
+def _own_recording(team: Team) -> Path | None:
+    """A folder for this run alone in that of the team file, if it names one."""
+    folder = team.recording.folder
+    return Path(folder) / time.strftime("%Y%m%d-%H%M%S", time.gmtime()) if folder else None
 
 
 def _print_how_to_watch(file: Path | None, endpoint: str, console: Console) -> None:

@@ -62,6 +62,10 @@ def observer(
     source: Source = None,
     connect: options.Connect = None,
     duration: Stay = None,
+    record: Annotated[
+        Path | None,
+        Option(callback=options.folder, help="Folder to record into what it takes and sends."),
+    ] = None,
     container: InContainer = False,
     image: options.Image = None,
     base_image: options.BaseImage = BASE_IMAGE,
@@ -91,12 +95,12 @@ def observer(
         given = {"at": at, "fov": fov, "move": move, "source": source}
         arguments = _arguments(given | {"duration": duration, "clock": clock}, endpoints, as_json)
         image = image or ensure_image(base_image, stop, line_printer(console))
-        raise Exit(run_observer_container(name, file_team, sensor, arguments, image, stop))
+        raise Exit(run_observer_container(name, file_team, sensor, arguments, image, stop, record))
     text = f"{name} joins team {team.name} at {', '.join(endpoints)}; Ctrl-C: it leaves"
     console.print(text, style="dim", highlight=False, soft_wrap=True)
     when = Clock.parse(clock) if clock else Clock.wall()
     limit_s = math.inf if duration is None else duration
-    result = run.run_observer(name, team, endpoints, when, stop, limit_s)
+    result = run.run_observer(name, team, endpoints, when, stop, limit_s, record)
     options.print_result(result, as_json, lambda: print_observer_report(result, console))
 
 

@@ -19,7 +19,7 @@ from cpcbl_launch.team.faults import one_line
 from cpcbl_launch.team.file import decode_resolved
 from cpcbl_team.config import Team
 
-BUS = "bus.mcap"  # what was heard on the bus, beside the robots' folders
+BUS = Path("bus.mcap")  # what was heard on the bus, beside the robots' folders
 
 
 class Segment(NamedTuple):

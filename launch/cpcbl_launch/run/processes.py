@@ -41,12 +41,18 @@ class Task(NamedTuple):
 
 
 def tasks(
-    team: Team, team_file: str, common: tuple[str, ...], seed: int, here: Collection[str]
+    team: Team,
+    team_file: str,
+    common: tuple[str, ...],
+    seed: int,
+    here: Collection[str],
+    record: str = "",
 ) -> list[Task]:
     """name | arguments | when: the field if any robot is simulated, one process a robot, the bridge
-    if the team file has a table `ros2`."""
+    if the team file has a table `ros2`. `record`: the folder that the robots record into."""
+    own = ("--record", record) if record else ()
     rows = [
-        Task(ROBOT + name, ("robot", team_file, name, *common), Identity(Role.ROBOT, name))
+        Task(ROBOT + name, ("robot", team_file, name, *common, *own), Identity(Role.ROBOT, name))
         for name in team.robots
         if name in here
     ]
@@ -67,7 +73,13 @@ class ProcessSpec(NamedTuple):
 
 
 def process_table(
-    team: Team, team_file: Path, endpoint: str, clock: Clock, seed: int, here: Collection[str]
+    team: Team,
+    team_file: Path,
+    endpoint: str,
+    clock: Clock,
+    seed: int,
+    here: Collection[str],
+    record: str = "",
 ) -> list[ProcessSpec]:
     """The same as processes of this machine, which end with the one that started them."""
     common = ("--connect", endpoint, "--clock", str(clock), "--parent", str(os.getpid()))
@@ -77,7 +89,7 @@ def process_table(
     }
     table = [
         ProcessSpec(name, (*PROGRAM, *arguments, *clocks.get(name, ())))
-        for name, arguments, _ in tasks(team, str(team_file), common, seed, here)
+        for name, arguments, _ in tasks(team, str(team_file), common, seed, here, record)
     ]
     if team.gateway is not None:
         gateway = ("gateway", str(team_file), "--connect", endpoint, "--parent", str(os.getpid()))

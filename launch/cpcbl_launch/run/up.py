@@ -4,7 +4,7 @@ import logging
 import socket
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext, suppress
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -16,6 +16,7 @@ import numpy as np
 
 from cpcbl_agents.clock import Clock
 from cpcbl_agents.earlier_processes import repeat_tokens
+from cpcbl_launch.recordings.read import BUS
 from cpcbl_launch.reporting.files import write_or_reason
 from cpcbl_launch.reporting.metrics import Floats
 from cpcbl_launch.reporting.phases import Span, guest_reports, phase_report
@@ -69,8 +70,14 @@ class Run(NamedTuple):
     epoch_ns: int | None = None  # robot time at the start; None: now
     folder: Path | None = None  # where processes write their logs; None: a temporary folder
     picture: Path | None = None  # the picture of the run to write (PNG or SVG)
-    record: Path | None = None  # the recording of the run to write (MCAP)
+    record: Path | None = None  # the recording to write: a file (MCAP), or the folder of a run
     connect: tuple[str, ...] = ()  # a router that runs; none: the run starts one
+
+    @property
+    def record_folder(self) -> Path | None:
+        """The folder that robots record into, if they do."""
+        is_folder = self.record is not None and self.record.suffix != BUS.suffix
+        return self.record if is_folder else None
 
 
 class Launcher(Protocol):
@@ -128,7 +135,9 @@ class OnThisMachine:
         team, path = self._run.team, self._folder / "team.json"
         save_resolved(team, path)
         endpoint = router_endpoint(self._run)
-        table = process_table(team, path, endpoint, clock, self._run.seed, self._here)
+        record = self._run.record_folder
+        where = str(record.absolute()) if record else ""
+        table = process_table(team, path, endpoint, clock, self._run.seed, self._here, where)
         return Supervisor(table, self._folder)
 
 
@@ -229,14 +238,22 @@ def simulate_run(run: Run, progress: Progress | None = None) -> Report:
 def _open_recording(run: Run, bus: Bus) -> AbstractContextManager[Recording | None]:
     if run.record is None:
         return nullcontext()
-    replayed = [name for name, robot in run.team.robots.items() if robot.source == "mrclam"]
-    if replayed:
-        what = f"{run.record}: without the inputs of {', '.join(replayed)}"
-        log.warning("%s: robots that replay a log do not publish them", what)
+    if (folder := run.record_folder) is not None:
+        path = folder / BUS
+        if path.exists():
+            raise InputError(f"--record {folder}: holds a run already; name another folder")
+        with suppress(OSError):  # what is wrong with it is said below
+            folder.mkdir(parents=True, exist_ok=True)
+    else:
+        path = run.record
+        replayed = [name for name, robot in run.team.robots.items() if robot.source == "mrclam"]
+        if replayed:
+            what = f"{path}: without the inputs of {', '.join(replayed)}"
+            log.warning("%s: robots that replay a log do not publish them", what)
     try:
-        return Recording(run.record, run.team, bus)
+        return Recording(path, run.team, bus)
     except OSError as error:
-        raise InputError(f"--record {run.record}: {error.strerror}; name another file") from error
+        raise InputError(f"--record {run.record}: {error.strerror}; name another one") from error
 
 
 def _report(

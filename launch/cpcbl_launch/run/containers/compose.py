@@ -31,6 +31,7 @@ class Mount(NamedTuple):
 
     source: str
     target: str
+    is_writable: bool = False
 
 
 class Deployment(NamedTuple):
@@ -46,6 +47,8 @@ class Deployment(NamedTuple):
     mounts: tuple[Mount, ...] = ()
     keys: Mount | None = None
     """The key folder of a secured team: of it each container may read its own part."""
+    record: Mount | None = None
+    """The folder that robots record into."""
     tokens: Mount | None = None
     """The gateway's tokens, a secret of its service; None: no gateway."""
     tokens_owner: str = ""  # uid:gid of who alone can read them
@@ -93,6 +96,13 @@ def deployment_text(team: Team, file: Path, folder: Path, image: str | None, see
         keys_folder = parse_team(file.read_text(encoding="utf-8")).transport.keys
         target = os.path.normpath(os.path.join("/team", keys_folder))
         how = how._replace(keys=Mount(_from(folder, Path(team.transport.keys)), target))
+    if team.recording.folder:
+        Path(team.recording.folder).mkdir(parents=True, exist_ok=True)  # Docker would as root
+        as_written = parse_team(file.read_text(encoding="utf-8")).recording.folder
+        target = os.path.normpath(os.path.join("/team", as_written))
+        record = Mount(team.recording.folder, target, is_writable=True)
+        how = how._replace(user=user_of(team, Identity(Role.ROUTER), record))
+        how = how._replace(record=record._replace(source=_from(folder, Path(record.source))))
     if team.gateway is not None:
         own = parse_team(file.read_text(encoding="utf-8")).gateway or GatewaySettings()
         inside = os.path.normpath(os.path.join("/team", own.tokens))
@@ -119,6 +129,15 @@ def key_owner(team: Team, identity: Identity) -> str:
         return ""
     credentials = credentials_in(Path(team.transport.keys), identity)
     whose = Path(credentials.private_key).stat()
+    return f"{whose.st_uid}:{whose.st_gid}"
+
+
+def user_of(team: Team, identity: Identity, record: Mount | None) -> str:
+    """uid:gid of who runs containers: who alone can read the keys, or else who owns the folder that
+    robots record into; empty where the image's will do. Raises SecurityError without the keys."""
+    if record is None or team.transport.secured:
+        return key_owner(team, identity)
+    whose = Path(record.source).stat()
     return f"{whose.st_uid}:{whose.st_gid}"
 
 
@@ -158,7 +177,8 @@ def compose_text(team: Team, how: Deployment) -> str:
     here = team.robots if how.here is None else how.here
     field = " the simulated field," if team.simulated else ""
     robots = "one robot" if len(here) == 1 else f"{len(here)} robots"
-    user = f"  user: {_flow(how.user)} # whose the keys are; nobody else can read them\n"
+    what = "folder of recordings is" if how.keys is None else "keys are; nobody else can read them"
+    user = f"  user: {_flow(how.user)} # whose the {what}\n"
     protocol = "tcp" if how.keys is None else "tls"
     speed = () if how.speed == 1.0 else ("--speed", f"{how.speed:g}")
     router = ("router", how.team_file, "--listen", f"{protocol}/0.0.0.0:{PORT}", *speed)
@@ -180,7 +200,9 @@ def compose_text(team: Team, how: Deployment) -> str:
         at=_flow(["CMD", "linked", "at", str(PORT)]),
     )
     services = []
-    for name, arguments, identity in tasks(team, how.team_file, common, how.seed, here):
+    for name, arguments, identity in tasks(
+        team, how.team_file, common, how.seed, here, how.record.target if how.record else ""
+    ):
         keys = _own_mounts(how, identity)
         services.append(_SERVICE.format(name=name, command=_flow(arguments), keys=keys))
     if team.gateway is not None and how.tokens is not None:
@@ -243,16 +265,22 @@ def _build(context: str, extras: str) -> str:
 
 
 def _own_mounts(how: Deployment, identity: Identity) -> str:
-    """What one service may read of a secured team: what all may, and its own keys."""
-    if how.keys is None:
-        return ""
-    own = Mount(f"{how.keys.source}/{identity}", f"{how.keys.target}/{identity}")
-    return _mounts((*how.mounts, own), "  ")
+    """What one service may read and write: what all may read, its own keys of a secured team, and
+    the folder that robots record into. Empty where that is what all may read."""
+    own = []
+    if how.keys is not None:
+        own.append(Mount(f"{how.keys.source}/{identity}", f"{how.keys.target}/{identity}"))
+    if how.record is not None and identity.role is Role.ROBOT:
+        own.append(how.record)
+    return _mounts((*how.mounts, *own), "  ") if own else ""
 
 
 def _mounts(mounts: Collection[Mount], indent: str) -> str:
     head = f"{indent}  volumes: # on every machine of a swarm\n"
-    binds = ({"type": "bind", **m._asdict(), "read_only": True} for m in mounts)
+    binds = (
+        {"type": "bind", "source": m.source, "target": m.target, "read_only": not m.is_writable}
+        for m in mounts
+    )
     lines = [f"{indent}    - {_flow(bind)}\n" for bind in binds]
     return "".join([head, *lines]) if lines else ""
 

@@ -38,6 +38,7 @@ DATA_INSIDE = "/team/data"
 KEYS_INSIDE = "/team/keys"
 SENSOR_INSIDE = "/team/sensor.toml"
 TOKENS_INSIDE = "/team/gateway-tokens.json"
+RECORD_INSIDE = "/team/recording"
 POLL_S = 0.1
 
 
@@ -122,15 +123,17 @@ class InContainers:
         if _replays(team):
             mounts.append(compose.Mount(str(Path(team.data).resolve()), DATA_INSIDE))
         tokens = None if team.gateway is None else Path(team.gateway.tokens).resolve()
+        record = None if run.record_folder is None else recording_mount(run.record_folder)
         how = compose.Deployment(
             INSIDE,
             self._image,
             published=tuple(map(published_router, transport.listen)),
             mounts=tuple(mounts),
             keys=compose.Mount(transport.keys, KEYS_INSIDE) if transport.secured else None,
+            record=record,
             tokens=None if tokens is None else compose.Mount(str(tokens), TOKENS_INSIDE),
             tokens_owner="" if tokens is None else compose.token_owner(team),
-            user=compose.key_owner(team, Identity(Role.ROUTER)),
+            user=compose.user_of(team, Identity(Role.ROUTER), record),
             seed=run.seed,
             speed=run.speed,
             clock=clock,
@@ -153,10 +156,18 @@ def team_in_containers(team: Team) -> Team:
     if team.transport.secured:
         transport = msgspec.structs.replace(team.transport, keys=KEYS_INSIDE)
         team = msgspec.structs.replace(team, transport=transport)
+    if team.recording.folder:  # the commands name the folder inside
+        recording = msgspec.structs.replace(team.recording, folder="")
+        team = msgspec.structs.replace(team, recording=recording)
     if team.gateway is not None:
         gateway = msgspec.structs.replace(team.gateway, tokens=TOKENS_INSIDE)
         team = msgspec.structs.replace(team, gateway=gateway)
     return team
+
+
+def recording_mount(folder: Path) -> compose.Mount:
+    """The folder that is recorded into, as robots in containers find it."""
+    return compose.Mount(str(folder.resolve()), RECORD_INSIDE, is_writable=True)
 
 
 def published_router(endpoint: str) -> str:
@@ -173,11 +184,18 @@ def _replays(team: Team) -> bool:
 
 
 def run_observer_container(
-    name: str, team: Team, sensor: str, arguments: Sequence[str], image: str, stop: Stop
+    name: str,
+    team: Team,
+    sensor: str,
+    arguments: Sequence[str],
+    image: str,
+    stop: Stop,
+    record: Path | None = None,
 ) -> int:
     """Runs `cpcbl-team observer TEAM NAME ARGUMENTS` in a container until it ends or `stop()`.
 
-    `sensor` is a preset or a file, which the container then reads. The container shares this
+    `sensor` is a preset or a file, which the container then reads; `record` the folder that it
+    records into. The container shares this
     machine's network, so that endpoints stay what they are, and this process's output. Returns its
     exit code. Raises DockerError, or SecurityError without the observer's keys.
     """
@@ -192,7 +210,11 @@ def run_observer_container(
             sensor = SENSOR_INSIDE
         container = f"cpcbl-{name}-{secrets.token_hex(3)}"
         inner = ["observer", INSIDE, name, f"--sensor={sensor}", *arguments]
-        user = compose.key_owner(team, Identity(Role.OBSERVER, name))
+        recording = None if record is None else recording_mount(record)
+        if recording is not None:
+            mounts.append(recording)
+            inner.append(f"--record={RECORD_INSIDE}")
+        user = compose.user_of(team, Identity(Role.OBSERVER, name), recording)
         command = docker_run(container, image, mounts, user, inner)
         process = subprocess.Popen(command, stdin=subprocess.DEVNULL, start_new_session=True)
         try:
@@ -220,10 +242,14 @@ def docker_run(
         *("--read-only", "--tmpfs", "/tmp", "--cap-drop", "ALL"),
         *("--security-opt", "no-new-privileges:true"),
         *(("--user", user) if user else ()),
-        *(part for m in mounts for part in ("--volume", f"{m.source}:{m.target}:ro")),
+        *(part for m in mounts for part in ("--volume", _volume(m))),
         image,
         *inner,
     ]
+
+
+def _volume(mount: compose.Mount) -> str:
+    return f"{mount.source}:{mount.target}" + ("" if mount.is_writable else ":ro")
 
 
 def mounts_of_keys(name: str, team: Team) -> list[compose.Mount]:

@@ -1,0 +1,157 @@
+"""Runs the nodes of a recorded run again, on what they took, and compares what comes out."""
+
+from itertools import islice
+
+import msgspec
+from msgspec.structs import replace
+
+from cpcbl_agents.flight_recorder import program_version
+from cpcbl_agents.flight_recorder.entries import Step
+from cpcbl_agents.flight_recorder.states import StateError
+from cpcbl_agents.node import GuestNode, Node, NodeStart
+from cpcbl_agents.robot import Robot, build_sensing
+from cpcbl_agents.sources.mrclam import LogError
+from cpcbl_launch.recordings.differences import Difference, DifferenceError
+from cpcbl_launch.recordings.playback import OnPut, Playback, PlayedBus, PlayedSource, ignore
+from cpcbl_launch.recordings.read import Process
+from cpcbl_launch.recordings.state_files import NodeState
+from cpcbl_launch.team.faults import one_line
+
+
+class Replayed(msgspec.Struct, frozen=True, kw_only=True):
+    """What a replay of one process found."""
+
+    robot: str
+    incarnation: str
+    version: str  # that recorded it
+    steps: int
+    messages: int
+    seconds: float  # since its start, by the robot's clock, to the latest step
+    difference: Difference | None = None
+    damage: tuple[str, ...] = ()
+
+
+class Replay:
+    """The node of one process, which is stepped as it was.
+
+    It begins with the first step that is there, or after that of `state`. Raises LogError where
+    that cannot be: the state is of another process or version, or the begin of the recording is
+    missing.
+    """
+
+    def __init__(
+        self, process: Process, on_put: OnPut = ignore, state: NodeState | None = None
+    ) -> None:
+        header = process.header
+        self._process, self.damage = process, list[str]()
+        self.playback = Playback(on_put)
+        self.difference: Difference | None = None
+        self.node: Node | None = None
+        self.now_ns, self.number = header.start_ns, header.first_step - 1  # of the latest step
+        self.begun_at = self.number + 1
+        self._steps = process.steps(self.damage)
+        if state is not None:
+            state.require_process(header.robot, header.incarnation)
+            for _ in islice(self._steps, state.step + 1 - header.first_step):
+                pass
+            self.now_ns, self.number = state.now_ns, state.step
+            self.node = self._restored(state.state, state.version, state.where)
+        elif header.first_step:
+            where = str(process.segments[0].path)
+            self.node = self._restored(header.state, header.version, where)
+        self.begun_at = self.number + 1
+        self.upcoming = next(self._steps, None)
+        """The step that comes next; None at the end."""
+
+    def _restored(self, state: bytes, version: str, where: str) -> Node:
+        if version != program_version():
+            raise LogError(
+                f"{where}: a state of version {version}, this is {program_version()}: replay it"
+                " with that version, or from the start of the process"
+            )
+        try:
+            node = self.playback.restored(state)
+        except StateError as error:
+            raise LogError(f"{where}: no state of a robot: {one_line(str(error))}") from error
+        if not isinstance(node, Node):
+            raise LogError(f"{where}: no state of a robot")
+        return node
+
+    def step(self) -> None:
+        """Makes the step that comes next; to be called while there is one."""
+        step = self.upcoming
+        assert step is not None
+        self.number, self.now_ns = self.number + 1, step.now_ns
+        self.playback.load(step)
+        try:
+            self._make(step)
+        except DifferenceError as error:
+            header = self._process.header
+            at_s = (step.now_ns - header.start_ns) * 1e-9
+            named = header.robot, header.incarnation
+            self.difference = error.difference(*named, self.number, at_s)
+            self.upcoming = None
+        else:
+            self.upcoming = next(self._steps, None)
+
+    def _make(self, step: Step) -> None:
+        if self.node is None:
+            self.node = node_of(self._process, self.playback)
+        elif step.leaves:
+            assert isinstance(self.node, GuestNode)
+            self.node.leave(step.now_ns)
+        else:
+            self.node.step(step.now_ns, self.playback.may_go_on)
+
+    @property
+    def state(self) -> NodeState:
+        """The state after the latest step."""
+        header = self._process.header
+        return NodeState(
+            version=program_version(),
+            robot=header.robot,
+            incarnation=header.incarnation,
+            step=self.number,
+            now_ns=self.now_ns,
+            state=self.playback.state(self.node),
+        )
+
+    @property
+    def result(self) -> Replayed:
+        header = self._process.header
+        return Replayed(
+            robot=header.robot,
+            incarnation=header.incarnation,
+            version=header.version,
+            steps=self.number + 1 - self.begun_at,
+            messages=self.playback.messages,
+            seconds=(self.now_ns - header.start_ns) * 1e-9,
+            difference=self.difference,
+            damage=tuple(self.damage),
+        )
+
+
+def node_of(process: Process, playback: Playback) -> Node:
+    """The node of a process as it started, on this tape. No file is opened: what the robot's log or
+    camera had is in the recording."""
+    header, team = process.header, process.team
+    name, own_team = header.robot, process.team
+    if not header.is_pose_given:
+        settings = replace(team.robots[name], start=None)
+        own_team = replace(team, robots={**team.robots, name: settings})
+    has_log = team.robots[name].source == "mrclam"
+    source = PlayedSource("", playback) if has_log else None
+    camera = PlayedSource("", playback) if header.has_camera else None
+    sensing = build_sensing(name, own_team, source, camera)
+    robot = Robot(name, own_team, header.robot_start_ns, sensing, header.restarted)
+    start = NodeStart(header.start_ns, header.incarnation, header.speed)
+    kind = GuestNode if header.is_guest else Node
+    return kind(robot, team, PlayedBus(playback), start, tape=playback)
+
+
+def replay_process(process: Process, until_ns: int | None = None) -> Replayed:
+    """Replays one process, to its end or to this time of the robot."""
+    replay = Replay(process)
+    while (step := replay.upcoming) is not None and (until_ns is None or step.now_ns <= until_ns):
+        replay.step()
+    return replay.result
