@@ -161,8 +161,8 @@ def _merged_file(run: Path) -> Path | None:
     if not run.is_dir():
         return run
     merged = run / MERGED
-    parts = [*run.glob(f"*/*{SUFFIX}"), *run.glob(BUS)]
     if not merged.is_file():
         return None
+    parts = [part for part in (*run.glob(f"*/*{SUFFIX}"), run / BUS) if part.is_file()]
     made_ns = merged.stat().st_mtime_ns
     return merged if all(part.stat().st_mtime_ns <= made_ns for part in parts) else None
