@@ -18,10 +18,12 @@ from cpcbl_launch.team.requirements import require_team_opencv
 from cpcbl_team.config import Variant
 from cpcbl_team.errors import InputError
 
-LogTeamFile = Annotated[
-    Path,
+TeamAndLog = Annotated[
+    list[Path],
     options.team_argument(
-        help="Team file, or a built-in one; mrclam is the one that was not calibrated on this log."
+        metavar="[TEAM] LOG",
+        help="Team file, or a built-in one (mrclam is the one that was not calibrated on this log),"
+        " and the folder of one data set, such as MRCLAM6; or a recorded run alone.",
     ),
 ]
 Collaboration = Annotated[
@@ -74,8 +76,7 @@ MarkdownFile = Annotated[
 
 
 def evaluate(
-    team_file: LogTeamFile,
-    data: Annotated[Path, Argument(metavar="LOG", help="Folder of one data set, e.g. MRCLAM6.")],
+    words: TeamAndLog,
     blind: options.Blind = "",
     variant: Annotated[Variant | None, Option(help="Variant of all robots.")] = None,
     collaboration: Collaboration = None,
@@ -92,7 +93,20 @@ def evaluate(
     export: ExportFolder = None,
     as_json: options.AsJson = False,
 ) -> None:
-    """Evaluate robots of a real log (UTIAS MRCLAM) against its ground truth, in one process."""
+    """Evaluate robots of a real log (UTIAS MRCLAM) against its ground truth, in one process.
+
+    Of a recorded run (folder or .mcap) what the robots stated then is scored: evaluate RUN.
+    """
+    from cpcbl_launch.recordings.gather import is_recording
+
+    if len(words) == 1 and is_recording(words[0]):
+        changes = [blind, variant, collaboration, fusion, direction, bytes_per_s, duration]
+        changes += [messages_per_minute, match_messages, unknown_starts, yardstick]
+        _evaluate_recording(words[0], any(changes), export, as_json)
+        return
+    if len(words) != 2:
+        raise InputError("evaluate: name a team and a log (mrclam MRCLAM6), or one recorded run")
+    team_file, data = words
     from cpcbl_launch.lab.evaluation import evaluate_log
     from cpcbl_launch.reporting.metrics import export_tum
     from cpcbl_launch.run import logged_team
@@ -119,13 +133,38 @@ def evaluate(
     options.print_result(result, as_json, lambda: print_report(result, Console()), lost)
 
 
+def _evaluate_recording(run: Path, is_changed: bool, export: Path | None, as_json: bool) -> None:
+    """Prints the figures of what was recorded. Raises InputError for options that change a run."""
+    from cpcbl_launch.recordings.summary import summarize
+    from cpcbl_launch.reporting.metrics import export_tum
+    from cpcbl_launch.views.run import print_report
+
+    if is_changed:
+        raise InputError(
+            f"evaluate {run}: a recorded run is scored as it was; only --export and --json apply"
+        )
+    summary = summarize(run)
+    lost: dict[str, str] = {}
+    if export is not None:
+        paths = {name: summary.recorder.trajectory(name) for name in summary.names}
+        write = partial(export_tum, export, {"estimate": paths}, summary.truth)
+        lost = write_or_reason(export, write)
+    remarks = list(summary.remarks)
+    if not summary.truth:
+        remarks.append(f"{run}: holds no true poses, so errors are not known")
+    for remark in remarks:
+        typer.echo(remark, err=True)
+    result = summary.report
+    options.print_result(result, as_json, lambda: print_report(result, Console()), lost)
+
+
 def calibrate(
     words: Annotated[
         list[Path],
         Argument(
             metavar="[TEAM] LOG",
-            help="MRCLAM folders, or recordings of `up --record` (.mcap). TEAM: to which types are"
-            " added; default: the recorded team, or mrclam-uncalibrated.",
+            help="MRCLAM folders, or recorded runs of `up --record` (folders, .mcap). TEAM: to which"
+            " types are added; default: the recorded team, or mrclam-uncalibrated.",
         ),
     ],
     output: Annotated[
@@ -146,13 +185,15 @@ def calibrate(
     from cpcbl_launch.calibration.logs import read_logs
     from cpcbl_launch.calibration.reports import print_calibration
     from cpcbl_launch.calibration.team_types import base_team, calibrate_robots, calibrated_team
+    from cpcbl_launch.recordings.merge import recording_files
     from cpcbl_launch.views.run import progress_bar
 
     team_file, logs = options.team_and_files(words)
     if not logs:
         raise InputError(f"calibrate {team_file}: name logs after the team")
-    base, base_name = base_team(logs, team_file)
-    robot_logs = read_logs(logs)
+    with recording_files(logs) as files:
+        base, base_name = base_team(files, team_file)
+        robot_logs = read_logs(files)
     with progress_bar("calibrating", quiet=as_json) as progress:
         result = calibrate_robots(robot_logs, [log.resolve().name for log in logs], progress)
     text = calibrated_team(

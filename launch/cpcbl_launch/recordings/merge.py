@@ -7,8 +7,8 @@ them are Foxglove's (`foxglove`). The team and the version of the program are in
 import importlib.metadata
 import logging
 import os
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import BinaryIO
@@ -20,7 +20,7 @@ from mcap_protobuf.schema import register_schema
 
 from cpcbl_agents.flight_recorder.segments import SUFFIX
 from cpcbl_launch.recordings.foxglove import FoxgloveRun
-from cpcbl_launch.recordings.gather import MERGED, gather
+from cpcbl_launch.recordings.gather import MERGED, gather, is_recording
 from cpcbl_launch.recordings.read import BUS
 from cpcbl_launch.reporting.recorded_file import ABOUT, Recorded, RecordedFile
 from cpcbl_launch.reporting.recording import TEAM
@@ -44,6 +44,13 @@ class MergedRun(msgspec.Struct, frozen=True, kw_only=True):
     shown: dict[str, int]  # Foxglove's, by their schema
     bytes: int
     remarks: tuple[str, ...] = ()
+
+
+def merged_line(merged: MergedRun) -> str:
+    """What a person reads of it."""
+    what = f"team {merged.team}, {merged.seconds:.0f} s, {sum(merged.messages.values())} messages"
+    shown = f"{sum(merged.shown.values())} more for other programs"
+    return f"written: {merged.file} ({what}, {shown}, {merged.bytes / 1e6:.1f} MB)"
 
 
 def merge(run: Path, output: Path | None = None) -> MergedRun:
@@ -154,6 +161,18 @@ def indexed_recording(run: Path) -> Iterator[RecordedFile]:
         for remark in merge(run, merged).remarks:
             log.warning("%s", remark)
         yield RecordedFile(merged)
+
+
+@contextmanager
+def recording_files(paths: Sequence[Path]) -> Iterator[list[Path]]:
+    """The one file of each recorded run; of other logs their own paths."""
+    with ExitStack() as stack:
+        yield [
+            stack.enter_context(indexed_recording(path)).path
+            if path.is_dir() and is_recording(path)
+            else path
+            for path in paths
+        ]
 
 
 def _merged_file(run: Path) -> Path | None:
