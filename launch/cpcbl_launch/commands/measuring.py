@@ -163,8 +163,8 @@ def calibrate(
         list[Path],
         Argument(
             metavar="[TEAM] LOG",
-            help="MRCLAM folders, or recorded runs of `up --record` (folders, .mcap). TEAM: to which"
-            " types are added; default: the recorded team, or mrclam-uncalibrated.",
+            help="MRCLAM folders, or recorded runs of `up --record` (folders, .mcap). TEAM: to"
+            " which types are added; default: the recorded team, or mrclam-uncalibrated.",
         ),
     ],
     output: Annotated[
