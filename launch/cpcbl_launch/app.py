@@ -32,6 +32,7 @@ COMMANDS = {
     "merge": "recorded.merge",
     "report": "recorded.report",
     "evaluate": "measuring.evaluate",
+    "replay": "replaying.replay",
     "chaos": "measuring.chaos",
     "list": "diagnosing.list_teams",
     "robot": "",  # it has a parser of its own

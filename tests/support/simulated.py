@@ -1,6 +1,7 @@
 """Simulated teams that are recorded, or have guests that come and go at set times."""
 
 from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from types import MappingProxyType
 from typing import NamedTuple
@@ -8,7 +9,9 @@ from typing import NamedTuple
 from msgspec.structs import replace
 
 from cpcbl_agents.node import GuestNode, NodeStart, Steppable
-from cpcbl_agents.robot import NEVER_NS, build_robot
+from cpcbl_agents.process import tape_for
+from cpcbl_agents.robot import NEVER_NS, Robot, build_robot
+from cpcbl_agents.tape import Tape
 from cpcbl_launch.reporting.recorder import Recorder, Report
 from cpcbl_launch.reporting.recording import Recording
 from cpcbl_launch.simulation.field import SimulatedField
@@ -20,6 +23,7 @@ from cpcbl_launch.simulation.in_process import (
     simulated_report,
 )
 from cpcbl_team.config import RobotSettings, Team
+from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus
 from cpcbl_transport.memory_bus import MemoryHub
 
@@ -34,10 +38,14 @@ class ScheduledGuest(NamedTuple):
 
 
 class ScheduledGuestNode:
-    """A visitor's node, with a session of its own from its coming to its going."""
+    """A visitor's node, with a session of its own from its coming to its going. `record`: the
+    folder that it records into."""
 
-    def __init__(self, visitor: ScheduledGuest, team: Team, hub: MemoryHub) -> None:
-        self._name, self._hub = visitor.name, hub
+    def __init__(
+        self, visitor: ScheduledGuest, team: Team, hub: MemoryHub, record: Path | None = None
+    ) -> None:
+        self._name, self._hub, self._record = visitor.name, hub, record
+        self._recording = ExitStack()
         self._team = replace(team, robots={**team.robots, visitor.name: visitor.settings})
         self._from_ns, self._until_ns = (round(s * 1e9) for s in visitor[2:])
         self._visit: GuestNode | None = None
@@ -57,7 +65,10 @@ class ScheduledGuestNode:
         if self._bus is None:
             self._bus = self._hub.session()
             robot = build_robot(self._name, self._team, now_ns)
-            self._visit = GuestNode(robot, self._team, self._bus, NodeStart(now_ns, "1"))
+            start = NodeStart(now_ns, "1")
+            tape = tape_for(robot, self._team, start, self._record, is_guest=True)
+            entered = self._recording.enter_context(tape)
+            self._visit = GuestNode(robot, self._team, self._bus, start, tape=entered)
         if self._visit is None:
             return
         if now_ns < self._until_ns:
@@ -65,6 +76,7 @@ class ScheduledGuestNode:
             return
         self._visit.leave(now_ns)
         self._visit = None
+        self._recording.close()
         self._bus.close()
 
 
@@ -77,6 +89,26 @@ def simulate_with_guests(
     visits = [ScheduledGuestNode(guest, team, hub) for guest in guests]
     run_simulated(team, seed, duration_s, hub, visits)
     return recorder
+
+
+def record_run(
+    folder: Path, team: Team, seed: int, duration_s: float, guests: Sequence[ScheduledGuest] = ()
+) -> None:
+    """Records a simulated team and its guests, as `simulate --record FOLDER` does. Robots publish
+    for a recorder and for one who looks at their poses and frames."""
+    hub = MemoryHub()
+    Recorder(hub.session())
+    for topic in (topics.POSE, topics.LOOK):
+        hub.session().subscribe(topic.at(), lambda key, payload: None)
+    visits = [ScheduledGuestNode(guest, team, hub, folder) for guest in guests]
+    field = FieldNode(SimulatedField(team, seed, 0), hub.session())
+    with ExitStack() as stack:
+
+        def record(robot: Robot, team: Team, start: NodeStart) -> Tape:
+            return stack.enter_context(tape_for(robot, team, start, folder))
+
+        robots = robot_nodes(team, hub, 0, tape_for=record)
+        run_nodes([field, *robots, *visits], 0, int(duration_s * 1e9))
 
 
 def simulate_recorded(

@@ -38,6 +38,7 @@ class SegmentWriter:
         self._added = self._written = 0  # bytes in memory; each is changed by one thread
         self._begun_s = self._synced_s = time.monotonic()
         self._is_synced = self._is_next_due = False
+        self._begins_at = 0  # the steps, in the present file
         self._stop = threading.Event()
         self._folder.mkdir(parents=True, exist_ok=True)
         self._file = self._begin_file()
@@ -102,7 +103,7 @@ class SegmentWriter:
         if not self._is_synced and (self._stop.is_set() or now_s - self._synced_s >= SYNC_S):
             os.fsync(self._file.fileno())
             self._synced_s, self._is_synced = now_s, True
-        is_large = self._file.tell() >= self._rules.segment_bytes
+        is_large = self._file.tell() - self._begins_at >= self._rules.segment_bytes
         if not self._is_next_due and (is_large or now_s - self._begun_s >= self._rules.segment_s):
             self._is_next_due = self.wants_state = True
 
@@ -127,7 +128,7 @@ class SegmentWriter:
         self._begun_s = self._synced_s = time.monotonic()
         file.write(header_block(replace(self._header, began_unix_s=time.time())))
         file.flush()
-        self._is_synced = False
+        self._begins_at, self._is_synced = file.tell(), False
         folder = os.open(self._folder, os.O_RDONLY)
         try:
             os.fsync(folder)  # the file's name

@@ -219,6 +219,7 @@ def simulate(
     match_messages: options.MatchMessages = None,
     report: options.ReportFile = None,
     picture: options.PictureFile = None,
+    record: options.RecordPath = None,
     as_json: options.AsJson = False,
 ) -> None:
     """Run a simulated team in one process, without Zenoh: deterministic for a seed.
@@ -234,7 +235,8 @@ def simulate(
     team = with_overrides(find_team(file or Path("demo")), budgets)
     require_team_opencv(team, team.robots, field=True)
     with progress_bar("simulating", quiet=as_json) as progress:
-        result = simulate_run(Run(team, duration, seed=seed, picture=picture), progress)
+        run = Run(team, duration, seed=seed, picture=picture, record=record)
+        result = simulate_run(run, progress)
     lost = options.write_report(report, result) | result.not_written
     options.print_result(result, as_json, lambda: print_report(result, Console()), lost)
 

@@ -132,6 +132,14 @@ PictureFile = Annotated[
         callback=writable_picture, help="File to draw the result into (PNG or SVG; extra `plot`)."
     ),
 ]
+RecordPath = Annotated[
+    Path | None,
+    Option(
+        callback=recording,
+        help="Folder to record the whole run into, to have it again with `replay`; or a file (MCAP)"
+        " for inputs, tracks, images, status and truth.",
+    ),
+]
 Image = Annotated[
     str | None,
     Option(help="Image of cpcbl-team to use; default: built from the checkout, when needed."),

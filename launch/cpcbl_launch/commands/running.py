@@ -48,14 +48,6 @@ Speed = Annotated[
     Option(callback=options.check_callback(_require_speed), help="Times real time, at least 0.05."),
 ]
 Robots = Annotated[str, Option(help="Robots to start on this machine; default: all.")]
-RecordPath = Annotated[
-    Path | None,
-    Option(
-        callback=options.recording,
-        help="Folder to record the whole run into, to have it again with `replay`; or a file (MCAP)"
-        " for inputs, tracks, images, status and truth.",
-    ),
-]
 ProcessLogs = Annotated[
     Path | None, Option(callback=options.folder, help="Folder for the logs of the processes.")
 ]
@@ -83,7 +75,7 @@ def up(
     match_messages: options.MatchMessages = None,
     report: options.ReportFile = None,
     picture: options.PictureFile = None,
-    record: RecordPath = None,
+    record: options.RecordPath = None,
     logs: ProcessLogs = None,
     containers: InContainersOption = False,
     image: options.Image = None,

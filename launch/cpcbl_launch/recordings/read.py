@@ -1,7 +1,7 @@
 """Reads a recorded run: a folder with a folder for each robot, and in it the files of each of its
 processes (`cpcbl_agents.flight_recorder.entries`)."""
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -73,6 +73,17 @@ class Run(NamedTuple):
     """The processes of each robot, in the order of their starts."""
     damage: tuple[str, ...]
     """What cannot be read, one line each with the file's path."""
+
+    def processes_of(self, names: Collection[str]) -> list[Process]:
+        """The processes of these robots, or of these `ROBOT/INCARNATION`; of all without a name.
+        Raises LogError for a name that the run does not have."""
+        every = [process for of_robot in self.processes.values() for process in of_robot]
+        known = {p.robot for p in every} | {f"{p.robot}/{p.header.incarnation}" for p in every}
+        if unknown := sorted(set(names) - known):
+            there = ", ".join(sorted(known))
+            raise LogError(f"{self.folder}: no robot {', '.join(unknown)}; there are {there}")
+        chosen = {p.robot for p in every} if not names else set(names)
+        return [p for p in every if {p.robot, f"{p.robot}/{p.header.incarnation}"} & chosen]
 
     @property
     def bus(self) -> Path | None:

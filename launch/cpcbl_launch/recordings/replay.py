@@ -1,19 +1,21 @@
 """Runs the nodes of a recorded run again, on what they took, and compares what comes out."""
 
+import math
+from collections.abc import Callable, Sequence
 from itertools import islice
 
 import msgspec
 from msgspec.structs import replace
 
 from cpcbl_agents.flight_recorder import program_version
-from cpcbl_agents.flight_recorder.entries import Step
+from cpcbl_agents.flight_recorder.entries import CUT_OFF, Step
 from cpcbl_agents.flight_recorder.states import StateError
 from cpcbl_agents.node import GuestNode, Node, NodeStart
 from cpcbl_agents.robot import Robot, build_sensing
 from cpcbl_agents.sources.mrclam import LogError
 from cpcbl_launch.recordings.differences import Difference, DifferenceError
 from cpcbl_launch.recordings.playback import OnPut, Playback, PlayedBus, PlayedSource, ignore
-from cpcbl_launch.recordings.read import Process
+from cpcbl_launch.recordings.read import Process, Run
 from cpcbl_launch.recordings.state_files import NodeState
 from cpcbl_launch.team.faults import one_line
 
@@ -31,16 +33,38 @@ class Replayed(msgspec.Struct, frozen=True, kw_only=True):
     damage: tuple[str, ...] = ()
 
 
+class RunReplayed(msgspec.Struct, frozen=True, kw_only=True):
+    """What a replay of a run found."""
+
+    version: str  # of this program, and a digest of its sources
+    processes: tuple[Replayed, ...]
+    damage: tuple[str, ...]
+    """What of the run could not be read, one line each."""
+
+    @property
+    def is_equal(self) -> bool:
+        """Whether all that there is was read, and came out to the bit. That a process was killed
+        while it wrote is no damage."""
+        damaged = [*self.damage, *(line for p in self.processes for line in p.damage)]
+        any_differs = any(p.difference is not None for p in self.processes)
+        return not any_differs and all(CUT_OFF in line for line in damaged)
+
+
 class Replay:
     """The node of one process, which is stepped as it was.
 
-    It begins with the first step that is there, or after that of `state`. Raises LogError where
+    It begins with the first step that is there, or after that of `state`, and ends so many seconds
+    after the start of the process, by its robot's clock. Raises LogError where
     that cannot be: the state is of another process or version, or the begin of the recording is
     missing.
     """
 
     def __init__(
-        self, process: Process, on_put: OnPut = ignore, state: NodeState | None = None
+        self,
+        process: Process,
+        on_put: OnPut = ignore,
+        state: NodeState | None = None,
+        until_s: float = math.inf,
     ) -> None:
         header = process.header
         self._process, self.damage = process, list[str]()
@@ -60,8 +84,18 @@ class Replay:
             where = str(process.segments[0].path)
             self.node = self._restored(header.state, header.version, where)
         self.begun_at = self.number + 1
-        self.upcoming = next(self._steps, None)
+        self._until_ns = header.start_ns + until_s * 1e9
+        self.upcoming = self._next_step()
         """The step that comes next; None at the end."""
+
+    def _next_step(self) -> Step | None:
+        step = next(self._steps, None)
+        return step if step is not None and step.now_ns <= self._until_ns else None
+
+    def run(self, stop: Callable[[], bool] = lambda: False) -> None:
+        """Makes all steps that are left, or until `stop()`."""
+        while self.upcoming is not None and not stop():
+            self.step()
 
     def _restored(self, state: bytes, version: str, where: str) -> Node:
         if version != program_version():
@@ -92,7 +126,7 @@ class Replay:
             self.difference = error.difference(*named, self.number, at_s)
             self.upcoming = None
         else:
-            self.upcoming = next(self._steps, None)
+            self.upcoming = self._next_step()
 
     def _make(self, step: Step) -> None:
         if self.node is None:
@@ -149,9 +183,15 @@ def node_of(process: Process, playback: Playback) -> Node:
     return kind(robot, team, PlayedBus(playback), start, tape=playback)
 
 
-def replay_process(process: Process, until_ns: int | None = None) -> Replayed:
-    """Replays one process, to its end or to this time of the robot."""
-    replay = Replay(process)
-    while (step := replay.upcoming) is not None and (until_ns is None or step.now_ns <= until_ns):
-        replay.step()
-    return replay.result
+def replayed(run: Run, replays: Sequence[Replay]) -> RunReplayed:
+    """What these replays of processes of a run found."""
+    results = tuple(replay.result for replay in replays)
+    return RunReplayed(version=program_version(), processes=results, damage=run.damage)
+
+
+def replay_run(run: Run) -> RunReplayed:
+    """Replays all processes of a run, one after the other."""
+    replays = [Replay(process) for process in run.processes_of(())]
+    for replay in replays:
+        replay.run()
+    return replayed(run, replays)

@@ -16,6 +16,10 @@ import numpy as np
 
 from cpcbl_agents.clock import Clock
 from cpcbl_agents.earlier_processes import repeat_tokens
+from cpcbl_agents.flight_recorder import recorded
+from cpcbl_agents.node import NodeStart
+from cpcbl_agents.robot import Robot
+from cpcbl_agents.tape import NO_TAPE, Tape
 from cpcbl_launch.recordings.read import BUS
 from cpcbl_launch.reporting.files import write_or_reason
 from cpcbl_launch.reporting.metrics import Floats
@@ -231,7 +235,21 @@ def simulate_run(run: Run, progress: Progress | None = None) -> Report:
             )
     duration_s = SIMULATED_S if run.duration_s is None else run.duration_s
     require_duration(duration_s, LEAST_S)
-    _, recorder = simulate(run.team, run.seed, duration_s, progress=progress)
+    with ExitStack() as stack:
+
+        def tape_for(robot: Robot, team: Team, start: NodeStart) -> Tape:
+            if (folder := run.record_folder) is None:
+                return NO_TAPE
+            return stack.enter_context(recorded(folder, robot, team, start))
+
+        _, recorder = simulate(
+            run.team,
+            run.seed,
+            duration_s,
+            watch=lambda bus: stack.enter_context(_open_recording(run, bus)),
+            progress=progress,
+            tape_for=tape_for,
+        )
     return _report(run, recorder, 0.0, duration_s, {})
 
 

@@ -4,7 +4,8 @@ from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 
 from cpcbl_agents.node import Node, NodeStart, Steppable
-from cpcbl_agents.robot import build_robot
+from cpcbl_agents.robot import Robot, build_robot
+from cpcbl_agents.tape import NO_TAPE, Tape
 from cpcbl_launch.reporting.recorder import Recorder, Report, variants_of
 from cpcbl_launch.simulation.field import SimulatedField
 from cpcbl_launch.simulation.field_node import FieldNode
@@ -14,6 +15,12 @@ from cpcbl_transport.memory_bus import MemoryHub
 
 Progress = Callable[[float], None]
 BusWrapper = Callable[[Bus], Bus]
+TapeFor = Callable[[Robot, Team, NodeStart], Tape]
+
+
+def no_tape(robot: Robot, team: Team, start: NodeStart) -> Tape:
+    """Records nothing."""
+    return NO_TAPE
 
 
 def simulate(
@@ -21,22 +28,24 @@ def simulate(
     seed: int,
     duration_s: float,
     truth: Team | None = None,
-    watch: Callable[[Bus], None] = lambda bus: None,
+    watch: Callable[[Bus], object] = lambda bus: None,
     over: Callable[[], bool] = lambda: False,
     progress: Progress | None = None,
     bus_wrappers: Mapping[str, BusWrapper] = MappingProxyType({}),
+    tape_for: TapeFor = no_tape,
 ) -> tuple[Report, Recorder]:
     """A simulated team, field and robots in one process.
 
     `truth` is the team as it really is, where that is not what its robots believe. `watch` may
     subscribe to the run, and `over` end it before its time; `bus_wrappers` put something between a
-    robot and its bus.
+    robot and its bus, and `tape_for` says what a robot's node records with.
     """
     hub, end_ns = MemoryHub(), int(duration_s * 1e9)
     recorder = Recorder(hub.session())
     watch(hub.session())
     field = FieldNode(SimulatedField(truth or team, seed, 0), hub.session())
-    run_nodes([field, *robot_nodes(team, hub, 0, bus_wrappers)], 0, end_ns, progress, over)
+    robots = robot_nodes(team, hub, 0, bus_wrappers, tape_for)
+    run_nodes([field, *robots], 0, end_ns, progress, over)
     return simulated_report(recorder, team), recorder
 
 
@@ -50,17 +59,21 @@ def robot_nodes(
     hub: MemoryHub,
     start_ns: int,
     bus_wrappers: Mapping[str, BusWrapper] = MappingProxyType({}),
+    tape_for: TapeFor = no_tape,
 ) -> list[Steppable]:
     """A node for each robot, each with a session of its own."""
+    start = NodeStart(start_ns, "0")
 
     def session(name: str) -> Bus:
         bus = hub.session()
         return bus_wrappers[name](bus) if name in bus_wrappers else bus
 
-    return [
-        Node(build_robot(name, team, start_ns), team, session(name), NodeStart(start_ns, "0"))
-        for name in team.robots
-    ]
+    def node(name: str) -> Node:
+        robot = build_robot(name, team, start_ns)
+        tape = tape_for(robot, team, start)
+        return Node(robot, team, session(name), start, tape=tape)
+
+    return [node(name) for name in team.robots]
 
 
 def run_nodes(
