@@ -238,7 +238,10 @@ def simulate(
         run = Run(team, duration, seed=seed, picture=picture, record=record)
         result = simulate_run(run, progress)
     lost = options.write_report(report, result) | result.not_written
-    options.print_result(result, as_json, lambda: print_report(result, Console()), lost)
+    console = Console(stderr=as_json)
+    if run.record_folder is not None:
+        lost |= options.merge_recording(run.record_folder, console)
+    options.print_result(result, as_json, lambda: print_report(result, console), lost)
 
 
 def chaos(

@@ -109,7 +109,7 @@ def up(
         result = run_team(run, table.show, StopSignal(), launch, attach)
     lost = dict(result.not_written) | options.write_report(report, result)
     if run.record_folder is not None:
-        lost |= _merge_recording(run.record_folder, console)
+        lost |= options.merge_recording(run.record_folder, console)
     options.print_result(result, as_json, lambda: print_report(result, console), lost)
     if not result.has_data and not StopSignal.was_interrupted:
         _fail_without_data(run)
@@ -119,22 +119,6 @@ def _own_recording(team: Team) -> Path | None:
     """A folder for this run alone in that of the team file, if it names one."""
     folder = team.recording.folder
     return Path(folder) / time.strftime("%Y%m%d-%H%M%S", time.gmtime()) if folder else None
-
-
-def _merge_recording(folder: Path, console: Console) -> dict[str, str]:
-    """Makes one file of the run. Returns the file and the reason where that failed: the robots'
-    own files are there all the same."""
-    from cpcbl_launch.recordings.gather import MERGED
-    from cpcbl_launch.recordings.merge import merge, merged_line
-
-    try:
-        merged = merge(folder)
-    except InputError as error:
-        return {str(folder / MERGED): str(error)}
-    except OSError as error:
-        return {str(folder / MERGED): error.strerror or str(error)}
-    console.print(merged_line(merged), style="dim", highlight=False, soft_wrap=True)
-    return {}
 
 
 def _print_how_to_watch(file: Path | None, endpoint: str, console: Console) -> None:
