@@ -135,7 +135,8 @@ bench-degraded: setup
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev,bench]'
 	PYTHONPATH=$(BENCH_PATH) $(BIN)/python -m benchmarks.degraded $(ARGS)
 
-# The view with teams of 4, 50 and 200 robots in Chromium; and docs/view.png, a picture of the demo.
+# The view with teams of 4, 50 and 200 robots in Chromium; docs/view.png, a picture of the demo, and
+# docs/report.png, of its report (ARGS=report: that alone).
 bench-view: setup
 	PYTHONPATH=$(BENCH_PATH) $(BIN)/python -m benchmarks.view_load $(ARGS)
 

@@ -100,6 +100,7 @@ WAYS = {
     "cpcbl-team compose team.toml": Way("robot-r1:"),
     "cpcbl-team compose team.toml > compose.yaml": Way("robot-r1:"),
     "cpcbl-team doctor team.toml": Way("r1", "trial", beside="team.toml", codes=(0, 1)),
+    "cpcbl-team evaluate RUN": Way("RMSE m"),
     "cpcbl-team evaluate calibrated.toml MRCLAM6": Way("RMSE m"),
     "cpcbl-team evaluate mrclam MRCLAM6 --blind 3,4,5 --collaboration none": Way("RMSE m"),
     "cpcbl-team evaluate mrclam MRCLAM6 --blind 3,4,5 --yardstick": Way("centralized EKF"),
@@ -152,9 +153,13 @@ WAYS = {
     " --connect ENDPOINT --duration 20": Way(
         "rover took part", "trial", "--duration 4", beside="blind", shows=(f"{GUEST} rover",)
     ),
+    "cpcbl-team merge RUN": Way("written: RUN/run.mcap"),
+    "cpcbl-team merge run.mcap --output shown.mcap": Way("written: shown.mcap"),
     "cpcbl-team observer blind tripod --at 4.5,6,-90 --connect ENDPOINT --duration 20": Way(
         "tripod took part", "trial", "--duration 4", beside="blind", shows=TRIPOD
     ),
+    "cpcbl-team report RUN -o report.html": Way("written: report.html"),
+    "cpcbl-team report RUN run.mcap -o report.html": Way("written: report.html"),
     "cpcbl-team robot team.toml r1": LIVE._replace(
         says="r1: connected to team lab", beside="router"
     ),
@@ -191,6 +196,7 @@ WAYS = {
     ),
     "cpcbl-team up team.toml": LIVE._replace(says=ALIVE),
     "cpcbl-team up team.toml --duration 120 --record run.mcap": Way(SIMULATED, "trial", SHORT),
+    "cpcbl-team view RUN": LIVE._replace(says="view of team demo", more="--listen :0"),
     "cpcbl-team view team.toml": LIVE._replace(
         says="view of team lab", more="--listen :0", beside="router"
     ),

@@ -205,8 +205,12 @@ def _image(encoding: str, data: bytes) -> bytes:
     if encoding == "json":
         return base64.b64decode(msgspec.json.decode(data)["data"])
     from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
+    from google.protobuf.message import DecodeError
 
-    return CompressedImage.FromString(data).data
+    try:
+        return CompressedImage.FromString(data).data
+    except DecodeError as error:
+        raise ValueError(f"an image cannot be read: {error}") from error
 
 
 class RecordedRun(NamedTuple):
