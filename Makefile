@@ -8,7 +8,7 @@ BIN = $(VENV)/bin
 export PYTHONDONTWRITEBYTECODE =
 
 .PHONY: setup demo test quick check unit test-long test-recordings test-ros2 test-trial test-compiled test-docker test-bench \
-  chaos net fuzz compiled bench bench-degraded bench-detection bench-latency bench-pictures \
+  chaos net recording fuzz compiled bench bench-degraded bench-detection bench-latency bench-pictures \
   bench-processes bench-scaling bench-view screenshot clean
 
 setup: $(VENV)/ready
@@ -94,6 +94,10 @@ net: setup
 # Meaningless payloads on every key of a running team: some minutes.
 fuzz: setup
 	$(BIN)/pytest -q tests/fuzz
+
+# The recording that the tests replay, anew, with what has moved; see tests/support/kept_recording.py.
+recording: setup
+	PYTHONPATH=$(BENCH_PATH) PYTHONHASHSEED=0 $(BIN)/python -m support.kept_recording
 
 # The core with its hot files compiled (hatch_build.py), and the benchmarks' yardstick: beside the
 # checkout's own, which stay as they are. Needs a C compiler.

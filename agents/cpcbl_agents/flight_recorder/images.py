@@ -10,8 +10,6 @@ CARRIES_IMAGES = ("in/", "look/")
 
 def without_image(key: str, payload: bytes) -> bytes:
     """A camera's frame, plain or annotated, without its image; anything else as it is."""
-    if not key.startswith(CARRIES_IMAGES):
-        return payload
     message = decode_by_key(key, payload)
     if isinstance(message, Frame | AnnotatedFrame):
         return encode(replace(message, image=b""))

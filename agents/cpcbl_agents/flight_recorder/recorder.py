@@ -20,7 +20,7 @@ from cpcbl_agents.flight_recorder.entries import (
     TokenTaken,
     Undeclared,
 )
-from cpcbl_agents.flight_recorder.images import without_image
+from cpcbl_agents.flight_recorder.images import CARRIES_IMAGES, without_image
 from cpcbl_agents.flight_recorder.segments import SegmentWriter
 from cpcbl_agents.flight_recorder.states import encode_state
 from cpcbl_agents.sources import OwnCamera, Picture, Source
@@ -116,7 +116,9 @@ class FlightRecorder(Tape):
 
     def without_image(self, key: str, payload: bytes) -> bytes:
         """A payload as it is noted: images only if they are kept."""
-        return payload if self._keeps_images else without_image(key, payload)
+        if self._keeps_images or not key.startswith(CARRIES_IMAGES):
+            return payload
+        return without_image(key, payload)
 
     def wrap_bus(self, bus: Bus) -> Bus:
         return _RecordedBus(bus, self)
@@ -163,18 +165,20 @@ class _RecordedArrivals(Arrivals):
         return token
 
     def take_message(self) -> tuple[str, bytes]:
-        key, payload = super().take_message()
-        self._recorder.note(MessageTaken(key, payload), len(payload))
-        return key, payload
+        message = self._inbox.take()
+        self._recorder.note(MessageTaken(*message), len(message[1]))
+        return message
 
     def take_frame(self) -> tuple[str, bytes] | None:
-        if (frame := super().take_frame()) is not None:
-            key, payload = frame[0], self._recorder.without_image(*frame)[: LARGEST_FRAME + 1]
-            self._recorder.note(FrameTaken(key, payload), len(payload))
+        if not self._frames:
+            return None
+        frame = self._frames.popleft()
+        payload = self._recorder.without_image(*frame)[: LARGEST_FRAME + 1]
+        self._recorder.note(FrameTaken(frame[0], payload), len(payload))
         return frame
 
     def note_taken(self, taken: int, waiting: int) -> None:
-        super().note_taken(taken, waiting)
+        self._inbox.is_fair = taken < waiting
         if taken < waiting:
             self._recorder.note_waiting(waiting)
 
@@ -227,11 +231,15 @@ class _RecordedPublisher(PublisherProxy):
     def __init__(self, publisher: Publisher, key: str, recorder: FlightRecorder) -> None:
         super().__init__(publisher)
         self._key, self._recorder = key, recorder
+        self._answer: bool | None = None
         self.restored_as = ("publisher", key)
 
     @property
     def matching(self) -> bool:
-        return self._recorder.answer(self._key, self._publisher.matching)
+        answer = self._publisher.matching
+        if answer is not self._answer:  # the question that is asked most often
+            self._answer = self._recorder.answer(self._key, answer)
+        return answer
 
     def put(self, payload: bytes) -> None:
         payload_noted = self._recorder.without_image(self._key, payload)

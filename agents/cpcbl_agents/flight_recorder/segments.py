@@ -1,7 +1,7 @@
 """Writes the steps of a node into files, on a thread of its own: a slow disk delays no step.
 
-What is over is written twice a second and reaches the disk (fsync) once a second. Whatever goes
-wrong ends the recording, never the robot.
+What is over is written once a second, and reaches the disk (fsync) then. Whatever goes wrong ends
+the recording, never the robot.
 """
 
 import os
@@ -17,7 +17,7 @@ from msgspec.structs import replace
 from cpcbl_agents.flight_recorder.entries import Header, Step, header_block, steps_block
 from cpcbl_team.config import RecordingSettings
 
-WRITE_S, SYNC_S = 0.5, 1.0
+WRITE_S = 1.0
 LARGEST_BACKLOG = 32 * 1024 * 1024  # bytes that wait for the disk
 PATIENCE_S = 1.8  # for the thread at the end
 SUFFIX = ".cpcbl"
@@ -36,8 +36,7 @@ class SegmentWriter:
         self._steps: deque[tuple[Step | bytes, int]] = deque()
         self._number = 0  # of the next step
         self._added = self._written = 0  # bytes in memory; each is changed by one thread
-        self._begun_s = self._synced_s = time.monotonic()
-        self._is_synced = self._is_next_due = False
+        self._begun_s, self._is_next_due = time.monotonic(), False
         self._begins_at = 0  # the steps, in the present file
         self._stop = threading.Event()
         self._folder.mkdir(parents=True, exist_ok=True)
@@ -99,12 +98,9 @@ class SegmentWriter:
                 steps = []
                 self._begin_next_file(item)
         self._write_steps(steps)
-        now_s = time.monotonic()
-        if not self._is_synced and (self._stop.is_set() or now_s - self._synced_s >= SYNC_S):
-            os.fsync(self._file.fileno())
-            self._synced_s, self._is_synced = now_s, True
         is_large = self._file.tell() - self._begins_at >= self._rules.segment_bytes
-        if not self._is_next_due and (is_large or now_s - self._begun_s >= self._rules.segment_s):
+        is_old = time.monotonic() - self._begun_s >= self._rules.segment_s
+        if not self._is_next_due and (is_large or is_old):
             self._is_next_due = self.wants_state = True
 
     def _write_steps(self, steps: list[Step]) -> None:
@@ -112,10 +108,9 @@ class SegmentWriter:
         if steps:
             self._file.write(steps_block(steps))
             self._file.flush()
-            self._is_synced = False
+            os.fsync(self._file.fileno())
 
     def _begin_next_file(self, state: bytes) -> None:
-        os.fsync(self._file.fileno())
         self._file.close()
         number = self._header.segment + 1
         self._header = replace(self._header, segment=number, first_step=self._number, state=state)
@@ -125,10 +120,11 @@ class SegmentWriter:
     def _begin_file(self) -> BinaryIO:
         name = f"{self._header.incarnation}-{self._header.segment:04}{SUFFIX}"
         file = (self._folder / name).open("xb")
-        self._begun_s = self._synced_s = time.monotonic()
+        self._begun_s = time.monotonic()
         file.write(header_block(replace(self._header, began_unix_s=time.time())))
         file.flush()
-        self._begins_at, self._is_synced = file.tell(), False
+        os.fsync(file.fileno())
+        self._begins_at = file.tell()
         folder = os.open(self._folder, os.O_RDONLY)
         try:
             os.fsync(folder)  # the file's name

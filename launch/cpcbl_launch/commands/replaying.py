@@ -134,6 +134,8 @@ def _print(result: "RunReplayed") -> None:
         counted = f"{process.steps} steps, {process.messages} messages, {process.seconds:.1f} s"
         if process.difference is None:
             typer.echo(f"{name}: equal to the bit: {counted}")
+            if process.exception:
+                typer.echo(f"{name}: it ended by an exception then: {process.exception}")
         else:
             typer.secho(f"differs: {process.difference}", fg="red")
     for line in (*result.damage, *(line for p in result.processes for line in p.damage)):

@@ -54,7 +54,7 @@ class Playback(Tape):
         self._on_put = on_put
         self._step, self._next = Step(0, ()), 0
         self._answers: dict[str, Any] = {}
-        self._input: AnyEntry | None = None
+        self.input: AnyEntry | None = None  # the one that was taken last in this step
         self._handled = 0
         self.waiting_tokens = self.waiting_messages = 0
         self.messages = 0
@@ -62,7 +62,7 @@ class Playback(Tape):
 
     def load(self, step: Step) -> None:
         """The step that comes next."""
-        self._step, self._next, self._input = step, 0, None
+        self._step, self._next, self.input = step, 0, None
         self.waiting_tokens = sum(isinstance(e, TokenTaken) for e in step.entries)
         taken = sum(isinstance(e, MessageTaken) for e in step.entries)
         self.waiting_messages = taken if step.waiting < 0 else step.waiting
@@ -73,8 +73,8 @@ class Playback(Tape):
         return handled < self._handled
 
     def end(self) -> None:
-        if self._upcoming is not None:
-            raise DifferenceError(self._input, self._upcoming, None)
+        if self._upcoming is not None or not self._step.is_whole:
+            raise DifferenceError(self.input, self._upcoming, None)
 
     @property
     def _upcoming(self) -> AnyEntry | None:
@@ -87,14 +87,14 @@ class Playback(Tape):
         if not isinstance(entry, kind) or (isinstance(entry, Polled) and entry.source != name):
             return None
         self._next += 1
-        self._input = cast(AnyEntry, entry)
+        self.input = cast(AnyEntry, entry)
         return entry
 
     def take(self, kind: type[EntryT]) -> EntryT:
         """The same where there must be one."""
         entry = self.find(kind)
         if entry is None:  # the node did something else before
-            raise DifferenceError(self._input, self._upcoming, None)
+            raise DifferenceError(self.input, self._upcoming, None)
         return entry
 
     def answer(self, question: str) -> Any:
@@ -147,7 +147,7 @@ class Playback(Tape):
         """The node does this; it must have done it."""
         old = self._upcoming
         if old != entry:
-            raise DifferenceError(self._input, old, entry)
+            raise DifferenceError(self.input, old, entry)
         self._next += 1
 
     def put(self, key: str, payload: bytes) -> None:

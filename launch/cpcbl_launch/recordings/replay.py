@@ -1,8 +1,10 @@
 """Runs the nodes of a recorded run again, on what they took, and compares what comes out."""
 
 import math
+import traceback
 from collections.abc import Callable, Sequence
 from itertools import islice
+from pathlib import Path
 
 import msgspec
 from msgspec.structs import replace
@@ -30,6 +32,7 @@ class Replayed(msgspec.Struct, frozen=True, kw_only=True):
     messages: int
     seconds: float  # since its start, by the robot's clock, to the latest step
     difference: Difference | None = None
+    exception: str = ""  # that ended the process; without a difference also when it was recorded
     damage: tuple[str, ...] = ()
 
 
@@ -70,6 +73,7 @@ class Replay:
         self._process, self.damage = process, list[str]()
         self.playback = Playback(on_put)
         self.difference: Difference | None = None
+        self.exception = ""  # that the node raised
         self.node: Node | None = None
         self.now_ns, self.number = header.start_ns, header.first_step - 1  # of the latest step
         self.begun_at = self.number + 1
@@ -120,13 +124,27 @@ class Replay:
         try:
             self._make(step)
         except DifferenceError as error:
-            header = self._process.header
-            at_s = (step.now_ns - header.start_ns) * 1e-9
-            named = header.robot, header.incarnation
-            self.difference = error.difference(*named, self.number, at_s)
-            self.upcoming = None
+            self._end(error)
+        except Exception as error:  # whatever a node raises, or a recording that a person made
+            where = traceback.extract_tb(error.__traceback__)[-1]
+            self.exception = (
+                f"{type(error).__name__}: {error} ({Path(where.filename).name}:{where.lineno})"
+            )
+            self.upcoming = None  # a step that an exception ended is the last one
+            if step.is_whole:
+                self._end(DifferenceError(self.playback.input, None, None))
         else:
             self.upcoming = self._next_step()
+
+    def _end(self, error: DifferenceError) -> None:
+        """Ends here, for nothing that follows has a meaning."""
+        header = self._process.header
+        at_s = (self.now_ns - header.start_ns) * 1e-9
+        named = header.robot, header.incarnation
+        self.difference = error.difference(*named, self.number, at_s)
+        if self.exception:
+            self.difference = replace(self.difference, what="an exception", new=self.exception)
+        self.upcoming = None
 
     def _make(self, step: Step) -> None:
         if self.node is None:
@@ -161,6 +179,7 @@ class Replay:
             messages=self.playback.messages,
             seconds=(self.now_ns - header.start_ns) * 1e-9,
             difference=self.difference,
+            exception=self.exception,
             damage=tuple(self.damage),
         )
 

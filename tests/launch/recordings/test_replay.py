@@ -8,8 +8,8 @@ from itertools import chain
 from pathlib import Path
 
 import pytest
-from msgspec.structs import replace
-from support.simulated import ScheduledGuest, record_run
+from net.recording import platform_fingerprint
+from support.kept_recording import FOLDER, PLATFORM, SECONDS, record_mixed_run
 
 from cpcbl_agents.flight_recorder.entries import (
     Declared,
@@ -24,39 +24,13 @@ from cpcbl_launch.recordings.read import Process, Run, read_run
 from cpcbl_launch.recordings.replay import Replay, RunReplayed, replay_run
 from cpcbl_launch.recordings.state_files import read_state, write_state
 from cpcbl_launch.run.processes import PROGRAM
-from cpcbl_launch.team.file import builtin_path, load_team
-from cpcbl_launch.team.overrides import Overrides, with_overrides
-from cpcbl_team.config import Start, Team
-
-SECONDS = 12.0  # the demo's robots help each other from its tenth second on
-
-
-def mixed_team() -> Team:
-    """The demo with budgets; each robot has another variant, and one has to find its pose."""
-    team = with_overrides(load_team(builtin_path("demo")), Overrides(bytes_per_s=120.0))
-    variants = "joint", "circular", "oval", "weighted"
-    robots = {
-        name: replace(robot, localizer=replace(robot.localizer, variant=variant))
-        for (name, robot), variant in zip(team.robots.items(), variants, strict=True)
-    }
-    start = robots["scout"].start
-    assert start is not None
-    robots["scout"] = replace(robots["scout"], start=replace(start, known=False))
-    return replace(team, robots=robots)
-
-
-def tripod(team: Team) -> ScheduledGuest:
-    """A guest that sees the field for some seconds."""
-    start = Start(x_m=4.0, y_m=3.0, heading_deg=-90.0)
-    settings = replace(team.robots["observer"], start=start, waypoints_m=())
-    return ScheduledGuest("tripod", settings, 3.0, 11.0)
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run of the mixed team with its guest."""
-    folder, team = tmp_path_factory.mktemp("recorded") / "run", mixed_team()
-    record_run(folder, team, 1, SECONDS, [tripod(team)])
+    folder = tmp_path_factory.mktemp("recorded") / "run"
+    record_mixed_run(folder)
     return folder
 
 
@@ -166,6 +140,15 @@ def test_an_input_that_is_missing_makes_a_difference(run: Run, tmp_path: Path) -
     difference = with_changed_steps(tmp_path, process, steps).difference
     assert difference is not None
     assert difference.step >= number
+
+
+def test_the_kept_recording_is_had_again() -> None:
+    """What moves it is meant to: `make recording` renews it, and says what moved."""
+    if PLATFORM.read_text(encoding="utf-8").strip() != platform_fingerprint():
+        pytest.skip("the mathematics of this platform gives other bits than the recording's")
+    result = replay_run(read_run(FOLDER))
+    assert not [str(p.difference) for p in result.processes if p.difference is not None]
+    assert result.is_equal
 
 
 def test_a_part_of_a_run_and_a_state_between(run: Run, tmp_path: Path) -> None:
