@@ -2,9 +2,10 @@
 
 import logging
 import signal
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 from rich.console import Console
@@ -17,6 +18,9 @@ from cpcbl_launch.team.overrides import Overrides, with_blind_robots, with_overr
 from cpcbl_launch.team.requirements import require_team_opencv
 from cpcbl_team.config import Variant
 from cpcbl_team.errors import InputError
+
+if TYPE_CHECKING:
+    from cpcbl_launch.reporting.metrics import Floats, Trajectory
 
 TeamAndLog = Annotated[
     list[Path],
@@ -97,22 +101,17 @@ def evaluate(
 
     Of a recorded run (folder or .mcap) what the robots stated then is scored: evaluate RUN.
     """
-    from cpcbl_launch.recordings.gather import is_recording
-
-    if len(words) == 1 and is_recording(words[0]):
-        changes = [blind, variant, collaboration, fusion, direction, bytes_per_s, duration]
-        changes += [messages_per_minute, match_messages, unknown_starts, yardstick]
-        _evaluate_recording(words[0], any(changes), export, as_json)
+    budgets = bytes_per_s, messages_per_minute, match_messages
+    if len(words) == 1:
+        changes = blind, variant, collaboration, fusion, direction, duration, *budgets
+        is_changed = any((*changes, unknown_starts, yardstick))
+        _evaluate_recording(words[0], is_changed, export, as_json)
         return
-    if len(words) != 2:
-        raise InputError("evaluate: name a team and a log (mrclam MRCLAM6), or one recorded run")
-    team_file, data = words
+    team_file, data = _team_and_log(words)
     from cpcbl_launch.lab.evaluation import evaluate_log
-    from cpcbl_launch.reporting.metrics import export_tum
     from cpcbl_launch.run import logged_team
     from cpcbl_launch.views.run import print_report, progress_bar
 
-    budgets = bytes_per_s, messages_per_minute, match_messages
     overrides = Overrides(*budgets, variant, collaboration, fusion, direction)
     team = with_overrides(find_team(logged_team.file_for(team_file, data)), overrides)
     logged = logged_team.load_logged_team(team, data)
@@ -127,28 +126,47 @@ def evaluate(
             with_baselines=yardstick is not None,
             with_batch=yardstick == "batch",
         )
-    lost: dict[str, str] = {}
-    if export is not None:
-        lost = write_or_reason(export, partial(export_tum, export, paths, logged.truth))
+    lost = _export_paths(export, paths, logged.truth)
     options.print_result(result, as_json, lambda: print_report(result, Console()), lost)
+
+
+def _export_paths(
+    folder: Path | None,
+    paths: "Mapping[str, Mapping[str, Trajectory]]",
+    truth: "Mapping[str, Floats]",
+) -> dict[str, str]:
+    """Writes what `--export` asks for. Returns the folder and the reason where that failed."""
+    from cpcbl_launch.reporting.metrics import export_tum
+
+    if folder is None:
+        return {}
+    return write_or_reason(folder, partial(export_tum, folder, paths, truth))
+
+
+def _team_and_log(words: list[Path]) -> list[Path]:
+    if len(words) != 2:
+        raise InputError("evaluate: name a team and a log (mrclam MRCLAM6), or one recorded run")
+    return words
 
 
 def _evaluate_recording(run: Path, is_changed: bool, export: Path | None, as_json: bool) -> None:
     """Prints the figures of what was recorded. Raises InputError for options that change a run."""
+    from cpcbl_launch.recordings.gather import is_recording
     from cpcbl_launch.recordings.summary import summarize
-    from cpcbl_launch.reporting.metrics import export_tum
     from cpcbl_launch.views.run import print_report
 
+    if not is_recording(run):
+        raise InputError(
+            f"evaluate {run}: no recorded run (a folder of `up --record`, or .mcap); of a log name"
+            f" the team, too: evaluate mrclam {run}"
+        )
     if is_changed:
         raise InputError(
             f"evaluate {run}: a recorded run is scored as it was; only --export and --json apply"
         )
     summary = summarize(run)
-    lost: dict[str, str] = {}
-    if export is not None:
-        paths = {name: summary.recorder.trajectory(name) for name in summary.names}
-        write = partial(export_tum, export, {"estimate": paths}, summary.truth)
-        lost = write_or_reason(export, write)
+    paths = {name: summary.recorder.trajectory(name) for name in summary.names}
+    lost = _export_paths(export, {"estimate": paths}, summary.truth)
     remarks = list(summary.remarks)
     if not summary.truth:
         remarks.append(f"{run}: holds no true poses, so errors are not known")
@@ -239,8 +257,7 @@ def simulate(
         result = simulate_run(run, progress)
     lost = options.write_report(report, result) | result.not_written
     console = Console(stderr=as_json)
-    if run.record_folder is not None:
-        lost |= options.merge_recording(run.record_folder, console)
+    lost |= options.merge_recording(run.record_folder, console)
     options.print_result(result, as_json, lambda: print_report(result, console), lost)
 
 

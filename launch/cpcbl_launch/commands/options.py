@@ -189,9 +189,11 @@ def print_not_written(lost: Mapping[str, str]) -> None:
         raise Exit(1)
 
 
-def merge_recording(folder: Path, console: Console) -> dict[str, str]:
-    """Makes one file of the run. Returns the file and the reason where that failed: the robots'
-    own files are there all the same."""
+def merge_recording(folder: Path | None, console: Console) -> dict[str, str]:
+    """Makes one file of a run that was recorded into a folder. Returns the file and the reason
+    where that failed: the robots' own files are there all the same."""
+    if folder is None:
+        return {}
     from cpcbl_launch.recordings.gather import MERGED
     from cpcbl_launch.recordings.merge import merge, merged_line
 
