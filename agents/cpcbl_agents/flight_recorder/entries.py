@@ -58,6 +58,9 @@ class Detected(Entry, frozen=True, array_like=True, gc=False, tag="d"):
     stamp_ns: int
     sightings: bytes  # as on the bus; empty if the frame cannot be used
     reason: str  # why it cannot be used
+    per_focal: tuple[
+        float | None, ...
+    ] = ()  # of each sighting by markers, which the bus leaves out
     annotated: bytes | None = None  # as on the bus; without its image, as a frame that was taken
 
 

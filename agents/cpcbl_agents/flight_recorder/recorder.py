@@ -25,6 +25,7 @@ from cpcbl_agents.flight_recorder.segments import SegmentWriter
 from cpcbl_agents.flight_recorder.states import encode_state
 from cpcbl_agents.sources import OwnCamera, Picture, Source
 from cpcbl_agents.tape import SourceT, Tape
+from cpcbl_team.inputs import MarkerSighting
 from cpcbl_transport import topics
 from cpcbl_transport.bus import (
     Bus,
@@ -327,12 +328,19 @@ class _RecordedDetection(Detection):
     def collect(self) -> Sequence[DetectedFrame]:
         results = self._detection.collect()
         for stamp_ns, sightings, annotated in results:
-            found = b"" if isinstance(sightings, str) else encode(sightings)
-            reason = sightings if isinstance(sightings, str) else ""
+            found, reason, per_focal = b"", "", tuple[float | None, ...]()
+            if isinstance(sightings, str):
+                reason = sightings
+            else:
+                found = encode(sightings)
+                per_focal = tuple(
+                    s.heading_per_focal if isinstance(s, MarkerSighting) else None
+                    for s in sightings.sightings
+                )
             shown = None
             if annotated is not None:
                 key = topics.LOOK.at(robot=annotated.robot)
                 shown = self._recorder.without_image(key, encode(annotated))
             size = len(found) + len(shown or b"")
-            self._recorder.note(Detected(stamp_ns, found, reason, shown), size)
+            self._recorder.note(Detected(stamp_ns, found, reason, per_focal, shown), size)
         return results

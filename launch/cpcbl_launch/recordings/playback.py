@@ -7,6 +7,8 @@ from collections import Counter
 from collections.abc import Callable, Collection, Sequence
 from typing import Any, TypeVar, cast
 
+from msgspec.structs import asdict, replace
+
 from cpcbl_agents.arrivals import Arrivals
 from cpcbl_agents.detection_worker import DetectedFrame, Detection
 from cpcbl_agents.flight_recorder.entries import (
@@ -23,12 +25,13 @@ from cpcbl_agents.flight_recorder.entries import (
     TokenTaken,
     Undeclared,
 )
+from cpcbl_agents.flight_recorder.images import CARRIES_IMAGES, without_image
 from cpcbl_agents.flight_recorder.states import StateError, decode_state, encode_state
 from cpcbl_agents.node import NO_CALLBACKS
 from cpcbl_agents.sources import OwnCamera
 from cpcbl_agents.tape import SourceT, Tape
 from cpcbl_launch.recordings.differences import DifferenceError
-from cpcbl_team.inputs import Sightings
+from cpcbl_team.inputs import MarkerSighting, Sightings
 from cpcbl_transport.bus import Bus, Handle, LivelinessCallback, MessageCallback, Publisher
 from cpcbl_transport.messages import LARGEST_FRAME, AnnotatedFrame, decode_tagged
 from cpcbl_transport.topics import Qos
@@ -152,7 +155,10 @@ class Playback(Tape):
 
     def put(self, key: str, payload: bytes) -> None:
         """The node puts this on the bus."""
-        self.compare(Put(key, payload))
+        entry = Put(key, payload)
+        if key.startswith(CARRIES_IMAGES) and entry != self._upcoming:
+            entry = Put(key, without_image(key, payload))  # as it was noted
+        self.compare(entry)
         self.messages += 1
         self._on_put(key, payload)
 
@@ -336,11 +342,23 @@ class _PlayedDetection(Detection):
     def collect(self) -> Sequence[DetectedFrame]:
         results = []
         while (found := self._playback.find(Detected)) is not None:
-            sightings = decode_tagged(found.sightings) if found.sightings else found.reason
+            sightings = _sightings_of(found) if found.sightings else found.reason
             shown = None
             if found.annotated is not None:
                 shown = decode_tagged(found.annotated, LARGEST_FRAME)
-            assert isinstance(sightings, Sightings | str)
+            if not isinstance(sightings, str) and isinstance(shown, AnnotatedFrame):
+                shown = replace(shown, found=sightings.sightings)
             assert shown is None or isinstance(shown, AnnotatedFrame)
             results.append(DetectedFrame(found.stamp_ns, sightings, shown))
         return results
+
+
+def _sightings_of(found: Detected) -> Sightings:
+    """The sightings in a frame as the detector made them."""
+    frame = decode_tagged(found.sightings)
+    assert isinstance(frame, Sightings)
+    sightings = (
+        sighting if k is None else MarkerSighting(**asdict(sighting), heading_per_focal=k)
+        for sighting, k in zip(frame.sightings, found.per_focal, strict=True)
+    )
+    return Sightings(frame.stamp_ns, tuple(sightings))
