@@ -7,7 +7,7 @@ BIN = $(VENV)/bin
 # Where it is set, each process that the tests start compiles whatever it imports once more.
 export PYTHONDONTWRITEBYTECODE =
 
-.PHONY: setup demo test quick check unit test-long test-ros2 test-trial test-compiled test-docker test-bench \
+.PHONY: setup demo test quick check unit test-long test-recordings test-ros2 test-trial test-compiled test-docker test-bench \
   chaos net recording fuzz compiled bench bench-degraded bench-detection bench-latency bench-pictures \
   bench-processes bench-scaling bench-view bench-pairs screenshot clean
 
@@ -43,7 +43,7 @@ check: setup
 unit: setup
 	$(BIN)/pytest -n 4 --dist worksteal -m "$(USUAL)"
 
-USUAL = not long and not log and not pictures and not docker and not trial and not ros2
+USUAL = not long and not log and not pictures and not docker and not trial and not ros2 and not recordings
 
 # Minutes long; with CPCBL_MRCLAM=folder also on real logs, with CPCBL_PICTURES=folder real pictures.
 test-long: setup
@@ -58,6 +58,16 @@ test-ros2: setup $(PARTNERS)/ready
 $(PARTNERS)/ready: tests/ros2/partners.txt
 	$(PARTNERS_PYTHON) -m venv $(PARTNERS)
 	$(PARTNERS)/bin/python -m pip install --quiet --disable-pip-version-check -r $<
+	@touch $@
+
+# Programs of others that read merged runs, in a venv of their own.
+READERS = build/recording-readers
+test-recordings: setup $(READERS)/ready
+	CPCBL_PARTNERS=$(READERS) $(BIN)/pytest -n 2 -m recordings tests/recordings
+
+$(READERS)/ready: tests/recordings/partners.txt
+	$(PYTHON) -m venv $(READERS)
+	$(READERS)/bin/python -m pip install --quiet --disable-pip-version-check -r $<
 	@touch $@
 
 # What a new user does, with a browser; needs Chromium (Debian: apt-get install chromium).
@@ -130,7 +140,8 @@ bench-degraded: setup
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev,bench]'
 	PYTHONPATH=$(BENCH_PATH) $(BIN)/python -m benchmarks.degraded $(ARGS)
 
-# The view with teams of 4, 50 and 200 robots in Chromium; and docs/view.png, a picture of the demo.
+# The view with teams of 4, 50 and 200 robots in Chromium; docs/view.png, a picture of the demo, and
+# docs/report.png, of its report (ARGS=report: that alone).
 bench-view: setup
 	PYTHONPATH=$(BENCH_PATH) $(BIN)/python -m benchmarks.view_load $(ARGS)
 

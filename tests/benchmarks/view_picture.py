@@ -1,5 +1,5 @@
-"""Draws docs/view.png, the page beside the demo, and says how soon an ended robot is marked:
-`make screenshot`."""
+"""Draws docs/view.png, the page beside the demo, and says how soon an ended robot is marked; and
+docs/report.png, the report of a minute of it: `make screenshot`."""
 
 import asyncio
 import os
@@ -14,10 +14,16 @@ from pathlib import Path
 from PIL import Image
 from support.chromium import Tab, opened
 from support.processes import pids_of
+from support.simulated import simulate_recorded
 
+from cpcbl_launch.recordings.merge import merge
+from cpcbl_launch.recordings.summary import summarize
 from cpcbl_launch.run.processes import PROGRAM
+from cpcbl_launch.team.file import builtin_path, load_team
+from cpcbl_launch.views.report.page import report_page
 
-PICTURE = Path(__file__).parents[2] / "docs" / "view.png"
+DOCS = Path(__file__).parents[2] / "docs"
+REPORTED_S = 60.0
 DRAWN_S = 22.0  # after the first picture: teammates have helped each other for half of it
 
 
@@ -48,8 +54,27 @@ async def draw(picture: Path) -> None:
             finally:
                 up.send_signal(signal.SIGINT)
                 up.communicate()
+    _make_small(picture, 256)
+
+
+async def draw_report(picture: Path) -> None:
+    """The report of a simulated minute of the demo."""
+    with tempfile.TemporaryDirectory(prefix="cpcbl-") as name:
+        recorded, page = Path(name) / "demo.mcap", Path(name) / "report.html"
+        simulate_recorded(load_team(builtin_path("demo")), 1, REPORTED_S, recorded)
+        merged = merge(recorded, Path(name) / "run.mcap").file
+        page.write_text(report_page([summarize(Path(merged))]))
+        async with opened(page.as_uri(), Path(name), 1000, 1830) as tab:
+            await tab.resize(1000, 1830, scale=0.8)
+            await tab.wait_for("document.readyState === 'complete'")
+            await tab.save_screenshot(picture)
+    _make_small(picture, 160)
+
+
+def _make_small(picture: Path, colours: int) -> None:
     with Image.open(picture) as drawn:
-        drawn.convert("RGB").quantize(256, dither=Image.Dither.NONE).save(picture, optimize=True)
+        few = drawn.convert("RGB").quantize(colours, dither=Image.Dither.NONE)
+        few.save(picture, optimize=True)
     sys.stdout.write(f"{picture}: {picture.stat().st_size / 1000:.0f} kB\n")
 
 
@@ -64,4 +89,6 @@ async def _measure_mark(tab: Tab, pid: int, number: signal.Signals) -> None:
 
 
 if __name__ == "__main__":
-    asyncio.run(draw(Path(sys.argv[1]) if len(sys.argv) > 1 else PICTURE))
+    if "report" not in sys.argv[1:]:
+        asyncio.run(draw(DOCS / "view.png"))
+    asyncio.run(draw_report(DOCS / "report.png"))

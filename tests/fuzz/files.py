@@ -2,7 +2,7 @@
 
 A case is its kind and a number, by which it can be repeated. What reads a file is the code behind
 the commands: `check` and `simulate` for team files, `evaluate` for logs, `calibrate` for recordings
-and pictures, and a robot's camera for pictures.
+and pictures, a robot's camera for pictures, and `merge` and `report` for runs.
 """
 
 import json
@@ -28,6 +28,7 @@ from fuzz.mutations import (
     mutated_tree,
     one_of,
 )
+from fuzz.runs import read_merged, read_run, write_merged, write_run
 from mcap.writer import CompressionType, Writer
 from support.logs import log_team, write_log
 from support.simulated import simulate_recorded
@@ -296,4 +297,6 @@ KINDS: dict[str, tuple[Callable[[Path, random.Random], Path], Callable[[Path], N
     "log": (write_damaged_log, read_damaged_log),
     "recording": (write_recording, read_damaged_recording),
     "picture": (write_picture, read_damaged_picture),
+    "merged": (write_merged, read_merged),
+    "run": (write_run, read_run),
 }

@@ -1,6 +1,6 @@
 """Every damaged file is used, or refused in one line: no traceback, no hang, no long line.
 
-`make fuzz` tries 50,000 files; `make test` a few hundred.
+`make fuzz` tries 70,000 files; `make test` a few hundred.
 """
 
 import json
@@ -25,7 +25,15 @@ from cpcbl_launch.run.logged_team import load_logged_team
 from cpcbl_launch.team.file import TeamFileError, builtin_path, load_team, save_resolved
 from cpcbl_team.inputs import Odometry
 
-FEW = {"team": 120, "resolved": 120, "log": 120, "recording": 200, "picture": 300}
+FEW = {
+    "team": 120,
+    "resolved": 120,
+    "log": 120,
+    "recording": 200,
+    "picture": 300,
+    "merged": 30,
+    "run": 6,
+}
 MANY = 10_000  # of each kind
 
 

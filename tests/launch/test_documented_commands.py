@@ -45,8 +45,10 @@ class Way(NamedTuple):
 
 
 LIVE = Way("", "trial", until_sigint=True, codes=(ENDED_BY_SIGINT,))
+WATCHED = LIVE._replace(says="watched for", beside="team.toml")
 ALIVE = r" ok\b"  # the state of a robot in the live table
 EXPERIMENT = "written: "
+BUDGET = Way(EXPERIMENT, "long", "--team-size 2 --seeds 1")
 SHORT = "--duration 12"
 FIGURE_7 = "navigator, 5 loops, 50 runs", "navigator with a camera, 5 loops"
 GUEST = "before, during and after guest"
@@ -100,16 +102,13 @@ WAYS = {
     "cpcbl-team compose team.toml": Way("robot-r1:"),
     "cpcbl-team compose team.toml > compose.yaml": Way("robot-r1:"),
     "cpcbl-team doctor team.toml": Way("r1", "trial", beside="team.toml", codes=(0, 1)),
+    "cpcbl-team evaluate RUN": Way("RMSE m"),
     "cpcbl-team evaluate calibrated.toml MRCLAM6": Way("RMSE m"),
     "cpcbl-team evaluate mrclam MRCLAM6 --blind 3,4,5 --collaboration none": Way("RMSE m"),
     "cpcbl-team evaluate mrclam MRCLAM6 --blind 3,4,5 --yardstick": Way("centralized EKF"),
     "cpcbl-team evaluate mrclam MRCLAM6 --blind 3,4,5 --yardstick batch": Way("batch"),
-    "cpcbl-team experiment budget --team-size 5 --world chain --seeds 6": Way(
-        EXPERIMENT, "long", "--team-size 2 --seeds 1"
-    ),
-    "cpcbl-team experiment budget --world chain": Way(
-        EXPERIMENT, "long", "--team-size 2 --seeds 1"
-    ),
+    "cpcbl-team experiment budget --team-size 5 --world chain --seeds 6": BUDGET,
+    "cpcbl-team experiment budget --world chain": BUDGET,
     "cpcbl-team experiment budget MRCLAM6": Way(EXPERIMENT, "long"),
     "cpcbl-team experiment circular-vs-oval": Way(
         EXPERIMENT, "trial", "--seeds 1", shows=("navigator, 5 loops, 20 runs",)
@@ -152,9 +151,12 @@ WAYS = {
     " --connect ENDPOINT --duration 20": Way(
         "rover took part", "trial", "--duration 4", beside="blind", shows=(f"{GUEST} rover",)
     ),
+    "cpcbl-team merge RUN": Way("written: RUN/run.mcap"),
+    "cpcbl-team merge run.mcap --output shown.mcap": Way("written: shown.mcap"),
     "cpcbl-team observer blind tripod --at 4.5,6,-90 --connect ENDPOINT --duration 20": Way(
         "tripod took part", "trial", "--duration 4", beside="blind", shows=TRIPOD
     ),
+    "cpcbl-team report RUN -o report.html": Way("written: report.html"),
     "cpcbl-team robot team.toml r1": LIVE._replace(
         says="r1: connected to team lab", beside="router"
     ),
@@ -179,10 +181,8 @@ WAYS = {
     "cpcbl-team traffic demo --connect tcp/127.0.0.1:32885": Way(
         "status/", "trial", "--duration 3", beside="demo", shows=("team demo at",)
     ),
-    "cpcbl-team traffic team.toml": LIVE._replace(says="watched for", beside="team.toml"),
-    "cpcbl-team traffic team.toml --connect tcp/192.168.1.10:7447": LIVE._replace(
-        says="watched for", beside="team.toml"
-    ),
+    "cpcbl-team traffic team.toml": WATCHED,
+    "cpcbl-team traffic team.toml --connect tcp/192.168.1.10:7447": WATCHED,
     "cpcbl-team up --view": Way(
         SIMULATED, "trial", f"{SHORT} --view-listen :0", shows=("view of team demo",)
     ),
@@ -196,6 +196,7 @@ WAYS = {
     ),
     "cpcbl-team up team.toml": LIVE._replace(says=ALIVE),
     "cpcbl-team up team.toml --duration 120 --record run.mcap": Way(SIMULATED, "trial", SHORT),
+    "cpcbl-team view RUN": LIVE._replace(says="view of team demo", more="--listen :0"),
     "cpcbl-team view team.toml": LIVE._replace(
         says="view of team lab", more="--listen :0", beside="router"
     ),

@@ -11,12 +11,13 @@ import numpy as np
 from cpcbl_agents.vision.camera import Camera
 from cpcbl_launch.calibration.lens import parse_board
 from cpcbl_launch.simulation.camera.render import Light, Scene, SceneRobot, render
-from cpcbl_launch.team.file import builtin_path, parse_team
+from cpcbl_launch.team.file import builtin_path, load_team, parse_team
 from cpcbl_team.config import CameraSettings
 from cpcbl_team.geometry import Pose2
 from support.board_pictures import board_pictures
 from support.logs import write_log
 from support.processes import command_line
+from support.simulated import record_run, simulate_recorded
 
 TEAM = """name = "lab"
 [map.landmarks]
@@ -134,6 +135,14 @@ def _keys(path: Path) -> None:
     assert command_line("keys", path.with_name("team.toml")).returncode == 0
 
 
+def _run(path: Path) -> None:
+    record_run(path, load_team(builtin_path("demo")), 1, 3.0, with_bus=True)
+
+
+def _recording(path: Path) -> None:
+    simulate_recorded(load_team(builtin_path("demo")), 1, 3.0, path)
+
+
 MAKERS: dict[str, Callable[[Path], object]] = {
     **dict.fromkeys(("MRCLAM2", "MRCLAM4", "MRCLAM6"), _log),
     "calibrated.toml": lambda path: path.write_text(builtin_path("mrclam").read_text()),
@@ -144,6 +153,8 @@ MAKERS: dict[str, Callable[[Path], object]] = {
     "far.jpg": lambda path: _painted(path, red=(130, 190, 24, 24)),
     "drive.mp4": _film,
     "router.json5": _router_config,
+    "RUN": _run,
+    "run.mcap": _recording,
     "--re": _keys,  # --renew, --revoke
 }
 
@@ -156,6 +167,7 @@ def write_files(folder: Path, command: str, endpoint: str) -> None:
     if "look team.toml" in command:
         (folder / "team.toml").write_text(LAB + transport(endpoint))
     for name, make in MAKERS.items():
-        is_written = command.endswith(f"> {name}") or f"--output {name}" in command
+        is_written = command.endswith(f"> {name}")
+        is_written |= f"--output {name}" in command or f"--record {name}" in command
         if name in command and not is_written and not (folder / name).exists():
             make(folder / name)

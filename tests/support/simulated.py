@@ -12,6 +12,7 @@ from cpcbl_agents.node import GuestNode, NodeStart, Steppable
 from cpcbl_agents.process import tape_for
 from cpcbl_agents.robot import NEVER_NS, Robot, build_robot
 from cpcbl_agents.tape import Tape
+from cpcbl_launch.recordings.read import BUS
 from cpcbl_launch.reporting.recorder import Recorder, Report
 from cpcbl_launch.reporting.recording import Recording
 from cpcbl_launch.simulation.field import SimulatedField
@@ -92,10 +93,16 @@ def simulate_with_guests(
 
 
 def record_run(
-    folder: Path, team: Team, seed: int, duration_s: float, guests: Sequence[ScheduledGuest] = ()
+    folder: Path,
+    team: Team,
+    seed: int,
+    duration_s: float,
+    guests: Sequence[ScheduledGuest] = (),
+    with_bus: bool = False,
 ) -> None:
-    """Records a simulated team and its guests, as `simulate --record FOLDER` does. Robots publish
-    for a recorder and for one who looks at their poses and frames."""
+    """Records a simulated team and its guests, as `simulate --record FOLDER` does; with what the
+    bus carried, as `up` does. Robots publish for a recorder and for one who looks at their poses
+    and frames."""
     hub = MemoryHub()
     Recorder(hub.session())
     for topic in (topics.POSE, topics.LOOK):
@@ -107,6 +114,9 @@ def record_run(
         def record(robot: Robot, team: Team, start: NodeStart) -> Tape:
             return stack.enter_context(tape_for(robot, team, start, folder))
 
+        if with_bus:
+            folder.mkdir(exist_ok=True)
+            stack.enter_context(Recording(folder / BUS, team, hub.session()))
         robots = robot_nodes(team, hub, 0, tape_for=record)
         run_nodes([field, *robots, *visits], 0, int(duration_s * 1e9))
 

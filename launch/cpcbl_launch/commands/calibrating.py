@@ -86,7 +86,7 @@ Recordings = Annotated[
     list[Path] | None,
     Argument(
         metavar="[TEAM] RECORDING",
-        help=f"Recordings with truth (`up --record`, .mcap) of robots with cameras.{INTO}",
+        help=f"Recorded runs with truth (`up --record`) of robots with cameras.{INTO}",
     ),
 ]
 PoseFolder = Annotated[Path | None, Option(help="Or a folder of pictures that a robot took.")]
@@ -206,13 +206,15 @@ def sensor(
     )
     from cpcbl_launch.calibration.reports import print_camera_accuracy
     from cpcbl_launch.calibration.team_tables import robot_table, sensor_tables
+    from cpcbl_launch.recordings.merge import recording_files
 
     team_file, recordings = options.team_and_files(words or ())
     if bool(recordings) == (pictures is not None):
         raise InputError("calibrate sensor: name recordings, or --pictures FOLDER --poses FILE.csv")
     _check_target(team_file, output)
     if pictures is None:
-        dataset = dataset_from_recordings(recordings, robot)
+        with recording_files(recordings) as files:
+            dataset = dataset_from_recordings(files, robot)
     else:
         dataset = _dataset_from_pictures(pictures, poses, team_file, robot, as_json)
     is_robots_own = team_file is not None and not kind and len(dataset.robots) == 1

@@ -2,9 +2,10 @@
 
 import logging
 import signal
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 from rich.console import Console
@@ -18,10 +19,15 @@ from cpcbl_launch.team.requirements import require_team_opencv
 from cpcbl_team.config import Variant
 from cpcbl_team.errors import InputError
 
-LogTeamFile = Annotated[
-    Path,
+if TYPE_CHECKING:
+    from cpcbl_launch.reporting.metrics import Floats, Trajectory
+
+TeamAndLog = Annotated[
+    list[Path],
     options.team_argument(
-        help="Team file, or a built-in one; mrclam is the one that was not calibrated on this log."
+        metavar="[TEAM] LOG",
+        help="Team file, or a built-in one (mrclam is the one that was not calibrated on this log),"
+        " and the folder of one data set, such as MRCLAM6; or a recorded run alone.",
     ),
 ]
 Collaboration = Annotated[
@@ -74,8 +80,7 @@ MarkdownFile = Annotated[
 
 
 def evaluate(
-    team_file: LogTeamFile,
-    data: Annotated[Path, Argument(metavar="LOG", help="Folder of one data set, e.g. MRCLAM6.")],
+    words: TeamAndLog,
     blind: options.Blind = "",
     variant: Annotated[Variant | None, Option(help="Variant of all robots.")] = None,
     collaboration: Collaboration = None,
@@ -92,13 +97,21 @@ def evaluate(
     export: ExportFolder = None,
     as_json: options.AsJson = False,
 ) -> None:
-    """Evaluate robots of a real log (UTIAS MRCLAM) against its ground truth, in one process."""
+    """Evaluate robots of a real log (UTIAS MRCLAM) against its ground truth, in one process.
+
+    Of a recorded run (folder or .mcap) what the robots stated then is scored: evaluate RUN.
+    """
+    budgets = bytes_per_s, messages_per_minute, match_messages
+    if len(words) == 1:
+        changes = blind, variant, collaboration, fusion, direction, duration, *budgets
+        is_changed = any((*changes, unknown_starts, yardstick))
+        _evaluate_recording(words[0], is_changed, export, as_json)
+        return
+    team_file, data = _team_and_log(words)
     from cpcbl_launch.lab.evaluation import evaluate_log
-    from cpcbl_launch.reporting.metrics import export_tum
     from cpcbl_launch.run import logged_team
     from cpcbl_launch.views.run import print_report, progress_bar
 
-    budgets = bytes_per_s, messages_per_minute, match_messages
     overrides = Overrides(*budgets, variant, collaboration, fusion, direction)
     team = with_overrides(find_team(logged_team.file_for(team_file, data)), overrides)
     logged = logged_team.load_logged_team(team, data)
@@ -113,9 +126,53 @@ def evaluate(
             with_baselines=yardstick is not None,
             with_batch=yardstick == "batch",
         )
-    lost: dict[str, str] = {}
-    if export is not None:
-        lost = write_or_reason(export, partial(export_tum, export, paths, logged.truth))
+    lost = _export_paths(export, paths, logged.truth)
+    options.print_result(result, as_json, lambda: print_report(result, Console()), lost)
+
+
+def _export_paths(
+    folder: Path | None,
+    paths: "Mapping[str, Mapping[str, Trajectory]]",
+    truth: "Mapping[str, Floats]",
+) -> dict[str, str]:
+    """Writes what `--export` asks for. Returns the folder and the reason where that failed."""
+    from cpcbl_launch.reporting.metrics import export_tum
+
+    if folder is None:
+        return {}
+    return write_or_reason(folder, partial(export_tum, folder, paths, truth))
+
+
+def _team_and_log(words: list[Path]) -> list[Path]:
+    if len(words) != 2:
+        raise InputError("evaluate: name a team and a log (mrclam MRCLAM6), or one recorded run")
+    return words
+
+
+def _evaluate_recording(run: Path, is_changed: bool, export: Path | None, as_json: bool) -> None:
+    """Prints the figures of what was recorded. Raises InputError for options that change a run."""
+    from cpcbl_launch.recordings.gather import is_recording
+    from cpcbl_launch.recordings.summary import summarize
+    from cpcbl_launch.views.run import print_report
+
+    if not is_recording(run):
+        raise InputError(
+            f"evaluate {run}: no recorded run (a folder of `up --record`, or .mcap); of a log name"
+            f" the team, too: evaluate mrclam {run}"
+        )
+    if is_changed:
+        raise InputError(
+            f"evaluate {run}: a recorded run is scored as it was; only --export and --json apply"
+        )
+    summary = summarize(run)
+    paths = {name: summary.recorder.trajectory(name) for name in summary.names}
+    lost = _export_paths(export, {"estimate": paths}, summary.truth)
+    remarks = list(summary.remarks)
+    if not summary.truth:
+        remarks.append(f"{run}: holds no true poses, so errors are not known")
+    for remark in remarks:
+        typer.echo(remark, err=True)
+    result = summary.report
     options.print_result(result, as_json, lambda: print_report(result, Console()), lost)
 
 
@@ -124,8 +181,8 @@ def calibrate(
         list[Path],
         Argument(
             metavar="[TEAM] LOG",
-            help="MRCLAM folders, or recordings of `up --record` (.mcap). TEAM: to which types are"
-            " added; default: the recorded team, or mrclam-uncalibrated.",
+            help="MRCLAM folders, or recorded runs of `up --record` (folders, .mcap). TEAM: to"
+            " which types are added; default: the recorded team, or mrclam-uncalibrated.",
         ),
     ],
     output: Annotated[
@@ -146,13 +203,15 @@ def calibrate(
     from cpcbl_launch.calibration.logs import read_logs
     from cpcbl_launch.calibration.reports import print_calibration
     from cpcbl_launch.calibration.team_types import base_team, calibrate_robots, calibrated_team
+    from cpcbl_launch.recordings.merge import recording_files
     from cpcbl_launch.views.run import progress_bar
 
     team_file, logs = options.team_and_files(words)
     if not logs:
         raise InputError(f"calibrate {team_file}: name logs after the team")
-    base, base_name = base_team(logs, team_file)
-    robot_logs = read_logs(logs)
+    with recording_files(logs) as files:
+        base, base_name = base_team(files, team_file)
+        robot_logs = read_logs(files)
     with progress_bar("calibrating", quiet=as_json) as progress:
         result = calibrate_robots(robot_logs, [log.resolve().name for log in logs], progress)
     text = calibrated_team(
@@ -197,7 +256,9 @@ def simulate(
         run = Run(team, duration, seed=seed, picture=picture, record=record)
         result = simulate_run(run, progress)
     lost = options.write_report(report, result) | result.not_written
-    options.print_result(result, as_json, lambda: print_report(result, Console()), lost)
+    console = Console(stderr=as_json)
+    lost |= options.merge_recording(run.record_folder, console)
+    options.print_result(result, as_json, lambda: print_report(result, console), lost)
 
 
 def chaos(

@@ -8,6 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+from rich.console import Console
 from typer import Argument, CallbackParam, Context, Exit, Option, secho
 
 from cpcbl_launch.reporting.files import json_text, write_or_reason
@@ -206,6 +207,24 @@ def print_not_written(lost: Mapping[str, str]) -> None:
         secho(f"cpcbl-team: {name}: not written: {reason}", fg="red", err=True)
     if lost:
         raise Exit(1)
+
+
+def merge_recording(folder: Path | None, console: Console) -> dict[str, str]:
+    """Makes one file of a run that was recorded into a folder. Returns the file and the reason
+    where that failed: the robots' own files are there all the same."""
+    if folder is None:
+        return {}
+    from cpcbl_launch.recordings.gather import MERGED
+    from cpcbl_launch.recordings.merge import merge, merged_line
+
+    try:
+        merged = merge(folder)
+    except InputError as error:
+        return {str(folder / MERGED): str(error)}
+    except OSError as error:
+        return {str(folder / MERGED): error.strerror or str(error)}
+    console.print(merged_line(merged), style="dim", highlight=False, soft_wrap=True)
+    return {}
 
 
 def refuse_moved(old: str, target: str) -> None:

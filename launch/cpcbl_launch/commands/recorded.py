@@ -40,13 +40,11 @@ def merge(run: RunArgument, output: MergedFile = None, as_json: options.AsJson =
 
 
 def _print_merged(merged: "MergedRun", console: Console) -> None:
+    from cpcbl_launch.recordings.merge import merged_line
+
     for remark in merged.remarks:
         console.print(remark, highlight=False, soft_wrap=True)
-    total = sum(merged.messages.values())
-    what = f"team {merged.team}, {merged.seconds:.0f} s, {total} messages"
-    shown = f"{sum(merged.shown.values())} more for other programs"
-    text = f"{what}, {shown}, {merged.bytes / 1e6:.1f} MB"
-    console.print(f"written: {merged.file} ({text})", highlight=False, soft_wrap=True)
+    console.print(merged_line(merged), highlight=False, soft_wrap=True)
 
 
 def report(

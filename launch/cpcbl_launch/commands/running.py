@@ -96,9 +96,8 @@ def up(
     run = run._replace(speed=speed, seed=seed, folder=logs, picture=picture)
     run = run._replace(record=record or _own_recording(run.team))
     blind_team = with_blind_robots(run.team, options.parse_names(blind), run.left_out)
-    run = run._replace(team=blind_team, connect=tuple(connect or ()))
-    if robots:
-        run = run._replace(here=_robots_here(robots, run.team))
+    here = _robots_here(robots, blind_team) if robots else None
+    run = run._replace(team=blind_team, connect=tuple(connect or ()), here=here)
     console = Console(stderr=as_json)
     launch = _launch(run, containers, image, base_image, console)
     _print_how_to_watch(file, router_endpoint(run), console)
@@ -108,6 +107,7 @@ def up(
     with page as attach, LiveTable(title, run.team.robots, console, quiet=as_json) as table:
         result = run_team(run, table.show, StopSignal(), launch, attach)
     lost = dict(result.not_written) | options.write_report(report, result)
+    lost |= options.merge_recording(run.record_folder, console)
     options.print_result(result, as_json, lambda: print_report(result, console), lost)
     if not result.has_data and not StopSignal.was_interrupted:
         _fail_without_data(run)

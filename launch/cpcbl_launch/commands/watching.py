@@ -4,6 +4,7 @@ import logging
 import math
 import time
 from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -37,6 +38,14 @@ Source = Annotated[
 Stay = Annotated[
     float | None,
     Option(callback=options.duration, help="Seconds to stay; default: until Ctrl-C."),
+]
+TeamOrRun = Annotated[
+    Path | None,
+    Argument(
+        metavar="TEAM|RUN",
+        autocompletion=options.complete_team,
+        help="Team file, or a built-in one: demo (default); or a recorded run, folder or .mcap.",
+    ),
 ]
 InContainer = Annotated[
     bool, Option("--container", help="Run it in a container of its own (needs Docker).")
@@ -143,7 +152,7 @@ def traffic(
 
 
 def view(
-    file: options.TeamOrDemo = None,
+    file: TeamOrRun = None,
     team_name: Annotated[
         str | None, Option(help="The running team's name, where its file is not at hand.")
     ] = None,
@@ -157,28 +166,38 @@ def view(
 ) -> None:
     """Show a running team's field in a browser, live; also on a phone (--listen 0.0.0.0:8700).
 
-    The page only watches. It needs nothing from the internet.
+    Of a recorded run the page has its time: play, pause, jump. The page only watches. It
+    needs nothing from the internet.
     """
     from cpcbl_agents.process import StopSignal
+    from cpcbl_launch.recordings.gather import is_recording
     from cpcbl_launch.views.web.address import parse_listen
     from cpcbl_launch.views.web.server import ShownTeam
-    from cpcbl_launch.views.web.view import address_lines, view_team
+    from cpcbl_launch.views.web.view import address_lines, view_recording, view_team
 
+    console, where, stopped = Console(), parse_listen("--listen", listen), StopSignal()
+    until_s = math.inf if duration is None else time.monotonic() + duration
+
+    def show_address(team: str, address: str) -> None:
+        for line in address_lines(team, address, where):
+            console.print(line, highlight=False, soft_wrap=True)
+        if open_page:
+            launch(address)
+
+    def is_over() -> bool:
+        return stopped() or time.monotonic() > until_s
+
+    if file is not None and is_recording(file):
+        if connect or team_name:
+            raise InputError(f"view {file}: a recorded run; without --connect and --team-name")
+        view_recording(file, where, is_over, show_address)
+        return
     logging.getLogger("cpcbl_transport").setLevel(logging.ERROR)  # the page says it
     team = None if team_name is not None and file is None else find_team(file or Path("demo"))
     endpoints = tuple(connect or (team.transport if team else TransportSettings()).connect)
     link = Link(endpoints) if team is None else link_of(team, Identity(Role.OPERATOR), endpoints)
     shown = ShownTeam(team_name or (team.name if team else ""), ", ".join(endpoints), team)
-    console, where, stopped = Console(), parse_listen("--listen", listen), StopSignal()
-    until_s = math.inf if duration is None else time.monotonic() + duration
-
-    def show_address(address: str) -> None:
-        for line in address_lines(shown.name, address, where):
-            console.print(line, highlight=False, soft_wrap=True)
-        if open_page:
-            launch(address)
-
-    view_team(shown, link, where, lambda: stopped() or time.monotonic() > until_s, show_address)
+    view_team(shown, link, where, is_over, partial(show_address, shown.name))
 
 
 def look(

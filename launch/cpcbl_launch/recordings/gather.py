@@ -25,6 +25,7 @@ from cpcbl_transport import topics
 from cpcbl_transport.decoding import decode
 from cpcbl_transport.messages import Frame, Refusal, decode_tagged
 
+MERGED = "run.mcap"  # in the folder of a run, what `merge` makes of it
 MOST_OFF_NS = 10_000_000_000  # a stamp farther from the robot's clock says nothing of the time
 REMEMBERED = 512  # times of the latest messages of a key
 TAKEN = ("in/", "fix/", "belief/")
@@ -41,14 +42,22 @@ class Gathered(NamedTuple):
     """What is missing in it and why, one line each; complete when all messages were read."""
 
 
+def is_recording(path: Path) -> bool:
+    """Whether this is a recorded run, or is meant to be one."""
+    if not path.is_dir():
+        return path.suffix == ".mcap"
+    return any(path.glob("*.mcap")) or any(path.glob(f"*/*{SUFFIX}"))
+
+
 def gather(run: Path) -> Gathered:
     """The folder of a run, or a recording. Raises LogError, TeamFileError."""
     if not run.is_dir():
         return _of_file(run)
     bus = run / BUS
-    has_robots = any(run.glob(f"*/*{SUFFIX}"))
-    if bus.is_file() and not has_robots:
-        return _of_file(bus)
+    if not any(run.glob(f"*/*{SUFFIX}")):
+        for path in (bus, run / MERGED):
+            if path.is_file():
+                return _of_file(path)
     found = read_run(run)
     remarks = list(found.damage)
     processes = [process for of_robot in found.processes.values() for process in of_robot]

@@ -5,9 +5,12 @@ them are Foxglove's (`foxglove`). The team and the version of the program are in
 """
 
 import importlib.metadata
+import logging
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import BinaryIO
 
 import msgspec
@@ -15,16 +18,19 @@ from google.protobuf.message import Message as Protobuf
 from mcap.writer import Writer
 from mcap_protobuf.schema import register_schema
 
+from cpcbl_agents.flight_recorder.segments import SUFFIX
 from cpcbl_launch.recordings.foxglove import FoxgloveRun
-from cpcbl_launch.recordings.gather import gather
-from cpcbl_launch.reporting.recorded_file import ABOUT, Recorded
+from cpcbl_launch.recordings.gather import MERGED, gather, is_recording
+from cpcbl_launch.recordings.read import BUS
+from cpcbl_launch.reporting.recorded_file import ABOUT, Recorded, RecordedFile
 from cpcbl_launch.reporting.recording import TEAM
 from cpcbl_team.config import Team
 from cpcbl_transport.decoding import carried_type
 from cpcbl_transport.json_messages import encode_json, object_schema
 from cpcbl_transport.messages import AnnotatedFrame
 
-MERGED = "run.mcap"  # in the folder of a run
+log = logging.getLogger(__name__)
+
 CHUNK_BYTES = 1_048_576
 
 
@@ -38,6 +44,13 @@ class MergedRun(msgspec.Struct, frozen=True, kw_only=True):
     shown: dict[str, int]  # Foxglove's, by their schema
     bytes: int
     remarks: tuple[str, ...] = ()
+
+
+def merged_line(merged: MergedRun) -> str:
+    """What a person reads of it."""
+    what = f"team {merged.team}, {merged.seconds:.0f} s, {sum(merged.messages.values())} messages"
+    shown = f"{sum(merged.shown.values())} more for other programs"
+    return f"written: {merged.file} ({what}, {shown}, {merged.bytes / 1e6:.1f} MB)"
 
 
 def merge(run: Path, output: Path | None = None) -> MergedRun:
@@ -132,3 +145,43 @@ class _RunWriter:
 
 def _count(counts: dict[str, int], name: str) -> None:
     counts[name] = counts.get(name, 0) + 1
+
+
+@contextmanager
+def indexed_recording(run: Path) -> Iterator[RecordedFile]:
+    """A run as one file in which any time is found quickly: its own, or one that is made for the
+    time being. Raises LogError, TeamFileError."""
+    path = _merged_file(run)
+    recording = RecordedFile(path) if path is not None else None
+    if recording is not None and recording.is_whole:
+        yield recording
+        return
+    with TemporaryDirectory(prefix="cpcbl-") as folder:
+        merged = Path(folder) / MERGED
+        for remark in merge(run, merged).remarks:
+            log.warning("%s", remark)
+        yield RecordedFile(merged)
+
+
+@contextmanager
+def recording_files(paths: Sequence[Path]) -> Iterator[list[Path]]:
+    """The one file of each recorded run; of other logs their own paths."""
+    with ExitStack() as stack:
+        yield [
+            stack.enter_context(indexed_recording(path)).path
+            if path.is_dir() and is_recording(path)
+            else path
+            for path in paths
+        ]
+
+
+def _merged_file(run: Path) -> Path | None:
+    """The one file of a run, if it is no older than what it was made of."""
+    if not run.is_dir():
+        return run
+    merged = run / MERGED
+    if not merged.is_file():
+        return None
+    parts = [part for part in (*run.glob(f"*/*{SUFFIX}"), run / BUS) if part.is_file()]
+    made_ns = merged.stat().st_mtime_ns
+    return merged if all(part.stat().st_mtime_ns <= made_ns for part in parts) else None

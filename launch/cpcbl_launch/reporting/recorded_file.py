@@ -7,7 +7,7 @@ file that was not ended, because its writer was killed, is read up to its last w
 import base64
 import logging
 import struct
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
@@ -45,6 +45,7 @@ log = logging.getLogger(__name__)
 MAGIC = b"\x89MCAP0\r\n"
 ABOUT = "cpcbl-team"  # the name of the metadata
 CAMERAS = "/cameras/"  # pictures of a merged run, as protobuf
+DAY_NS = 86_400_000_000_000
 LARGEST_RECORD = 4 * (CHUNK_BYTES + LARGEST_FRAME)
 _arrays: msgspec.json.Decoder[Message] = msgspec.json.Decoder(Message)
 _Row = tuple[Schema | None, Channel, Record]
@@ -76,11 +77,35 @@ class RecordedFile:
         if not self.is_whole:
             log.warning("%s: it was not ended, so its last seconds are missing", path)
 
+    def span(self, beginnings: tuple[str, ...]) -> tuple[int, int] | None:
+        """The times of the first and the last message under keys that begin so; by the index, which
+        is quick, those of all messages, unless they are more than a day apart. Raises LogError."""
+        if self.is_whole and (indexed := self._indexed_span(beginnings)) is not None:
+            return indexed
+        first_ns, last_ns = LAST_NS, -1
+        for at_ns, _, _ in self.messages(lambda key: key.startswith(beginnings)):
+            first_ns, last_ns = min(first_ns, at_ns), max(last_ns, at_ns)
+        return None if last_ns < 0 else (first_ns, last_ns)
+
+    def _indexed_span(self, beginnings: tuple[str, ...]) -> tuple[int, int] | None:
+        with _readable(self.path), self.path.open("rb") as file:
+            summary = make_reader(file).get_summary()
+        if summary is None or summary.statistics is None:
+            return None
+        has_any = any(channel.topic.startswith(beginnings) for channel in summary.channels.values())
+        first_ns = summary.statistics.message_start_time
+        last_ns = summary.statistics.message_end_time
+        is_plausible = has_any and 0 <= last_ns - first_ns < DAY_NS
+        return (first_ns, last_ns) if is_plausible else None
+
     def messages(
-        self, *beginnings: str, from_ns: int | None = None, until_ns: int | None = None
+        self,
+        is_wanted: Callable[[str], bool] = lambda key: True,
+        from_ns: int | None = None,
+        until_ns: int | None = None,
     ) -> Iterator[Recorded]:
-        """Messages under keys that begin so (none: all), from `from_ns` on and before `until_ns`,
-        in the order of their times. Raises LogError."""
+        """Messages under keys that are wanted, from `from_ns` on and before `until_ns`, in the
+        order of their times. Raises LogError."""
         with _readable(self.path), self.path.open("rb") as file:
             if self.is_whole:
                 rows: Iterator[_Row] = make_reader(file).iter_messages(
@@ -88,7 +113,7 @@ class RecordedFile:
                 )
             else:
                 rows = _rows_of_cut(file, from_ns or 0, until_ns or LAST_NS)
-            yield from _decoded(rows, beginnings or ("",))
+            yield from _decoded(rows, is_wanted)
 
 
 @contextmanager
@@ -152,7 +177,7 @@ def _rows_of_cut(file: BinaryIO, from_ns: int, until_ns: int) -> Iterator[_Row]:
             yield schemas.get(channel.schema_id), channel, record
 
 
-def _decoded(rows: Iterator[_Row], beginnings: tuple[str, ...]) -> Iterator[Recorded]:
+def _decoded(rows: Iterator[_Row], is_wanted: Callable[[str], bool]) -> Iterator[Recorded]:
     """Annotated frames get their pictures, which come before them, in channels of their own."""
     pictures: dict[str, tuple[int, bytes]] = {}
     for schema, channel, record in rows:
@@ -160,9 +185,8 @@ def _decoded(rows: Iterator[_Row], beginnings: tuple[str, ...]) -> Iterator[Reco
         if key.startswith((PICTURES, CAMERAS)):
             robot = key.rpartition("/")[2]
             pictures[robot] = record.log_time, _image(channel.message_encoding, record.data)
-        if channel.message_encoding != "json" or not key.startswith(beginnings):
-            continue
-        if key.startswith(PICTURES):
+        is_ours = channel.message_encoding == "json" and not key.startswith(PICTURES)
+        if not is_ours or not is_wanted(key):
             continue
         if schema is None:
             message = _arrays.decode(record.data)
@@ -181,8 +205,12 @@ def _image(encoding: str, data: bytes) -> bytes:
     if encoding == "json":
         return base64.b64decode(msgspec.json.decode(data)["data"])
     from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
+    from google.protobuf.message import DecodeError
 
-    return CompressedImage.FromString(data).data
+    try:
+        return CompressedImage.FromString(data).data
+    except DecodeError as error:
+        raise ValueError(f"an image cannot be read: {error}") from error
 
 
 class RecordedRun(NamedTuple):
@@ -197,13 +225,17 @@ class RecordedRun(NamedTuple):
     truth: dict[str, Floats]
 
 
+def _is_calibrating(key: str) -> bool:
+    return key.startswith(("in/", "look/", topics.TRUTH.key))
+
+
 def read_recording(path: Path) -> RecordedRun:
     """Inputs and truth, as calibration needs them. Raises LogError, TeamFileError."""
     recording = RecordedFile(path)
     inputs: dict[str, list[SensorInput]] = {}
     found: dict[str, list[SensorInput]] = {}  # by robots' eyes in the frames that were shown
     truths: list[Truths] = []
-    for _, key, message in recording.messages("in/", "look/", topics.TRUTH.key):
+    for _, key, message in recording.messages(_is_calibrating):
         if isinstance(message, Truths):
             truths.append(message)
         if isinstance(message, AnnotatedFrame):

@@ -12,7 +12,7 @@ from cpcbl_launch.recordings.summary import RunSummary
 from cpcbl_launch.reporting.activity import REFUSALS
 from cpcbl_launch.reporting.recorder import RobotReport
 from cpcbl_launch.reporting.statuses import trust_remarks
-from cpcbl_launch.reporting.tables import number, percent, short
+from cpcbl_launch.reporting.tables import number, percent, short, times
 from cpcbl_launch.views.report.charts import (
     Drawn,
     Scales,
@@ -267,14 +267,14 @@ def events_section(shown: RunView) -> str:
         ):
             longest = max((b - a for a, b in spans), default=0.0)
             if spans:
-                words = f"{what} ({len(spans)} times, {longest:.1f} s at most)"
+                words = f"{what} ({times(len(spans))}, {longest:.1f} s at most)"
                 total = f"{sum(b - a for a, b in spans):.1f} s"
                 rows.append((drawn.path.name, total, words, "bad"))
         if drawn.path.outside:
             words = f"{drawn.path.outside} estimates have stamps outside of the run"
             rows.append((drawn.path.name, "", words, "warn"))
     rows += [
-        (name, "", f"was started again {n} times" if n > 1 else "was started again", "warn")
+        (name, "", f"was started again, {times(n)}", "warn")
         for name, n in run.report.restarts.items()
     ]
     summary = [_row(r, [d], after=_words(words, css)) for r, d, words, css in rows]

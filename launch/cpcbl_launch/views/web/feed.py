@@ -132,6 +132,14 @@ class Feed:
                 self._connected_s = None
             self._problem = problem
 
+    def clear(self) -> None:
+        """Forgets all that was received: a playback goes on at another time."""
+        with self._lock:
+            self._robots = dict.fromkeys(sorted(self.named), LatestMessages())
+            for log in (self._history, self._truths, self._unscored, self._frames):
+                log.clear()
+            self._connected_s = self.now_s()
+
     def watch(self, more: int) -> None:
         """So many more pages (or fewer) are open."""
         with self._lock:

@@ -54,6 +54,14 @@ class Frame(msgspec.Struct, frozen=True, tag="frame"):
     removed: list[str]
     help: tuple[Arrow, ...] | None  # all of it at present; None while it is as before
     skipped: int  # cycles for which this page was too slow, since it was opened
+    play: tuple[float, bool] | None = None  # of a recording: its speed, and whether it plays
+
+
+class RecordingPicture(msgspec.Struct, frozen=True):
+    """What a page must know of a recording."""
+
+    duration_s: float
+    begin_s: float  # by the stamps; a simulation may begin at 0
 
 
 class TeamPicture(msgspec.Struct, frozen=True, tag="team"):
@@ -64,6 +72,7 @@ class TeamPicture(msgspec.Struct, frozen=True, tag="team"):
     walls: list[tuple[str, float, float, float, float]]
     cameras: tuple[str, ...] | None  # robots with one; None where the team file is not at hand
     history: dict[str, list[tuple[float | None, ...]]]  # rows of `feed.TrailPoint`
+    recording: RecordingPicture | None = None  # None: live
 
 
 class InputPicture(msgspec.Struct, frozen=True):
@@ -93,7 +102,12 @@ class RobotDetail(msgspec.Struct, frozen=True, tag="detail"):
     trust: tuple[TrustReport, ...] = ()
 
 
-def team_picture(team: Team | None, name: str, history: Mapping[str, Any]) -> TeamPicture:
+def team_picture(
+    team: Team | None,
+    name: str,
+    history: Mapping[str, Any],
+    recording: RecordingPicture | None = None,
+) -> TeamPicture:
     """`team`: None where its file is not at hand."""
     field = Field() if team is None else team.map
     rows = {
@@ -106,6 +120,7 @@ def team_picture(team: Team | None, name: str, history: Mapping[str, Any]) -> Te
         walls=[(wall, *w.from_m, *w.to_m) for wall, w in field.walls.items()],
         cameras=None if team is None else team.cameras,
         history=rows,
+        recording=recording,
     )
 
 

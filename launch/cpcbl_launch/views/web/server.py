@@ -32,8 +32,10 @@ from cpcbl_launch.views.web.feed import Feed, Snapshot
 from cpcbl_launch.views.web.page_data import (
     Arrow,
     Frame,
+    RecordingPicture,
     RobotDetail,
     RobotPicture,
+    TeamPicture,
     difference,
     help_arrows,
     notice_text,
@@ -41,6 +43,7 @@ from cpcbl_launch.views.web.page_data import (
     robot_pictures,
     team_picture,
 )
+from cpcbl_launch.views.web.playback import Playback, Playing
 from cpcbl_team.config import Team
 
 CYCLE_S = 0.1
@@ -58,6 +61,7 @@ PAGE = (
     "colours.js",
     "field.js",
     "panel.js",
+    "player.js",
     "plots.js",
     "icon.svg",
 )
@@ -69,6 +73,7 @@ class ShownTeam(NamedTuple):
     name: str
     where: str  # its router, for people
     team: Team | None = None  # None where the team file is not at hand
+    playback: Playback | None = None  # None: it is shown live
 
 
 class Request(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -77,6 +82,9 @@ class Request(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ack: int | None = None  # the number of a frame
     robot: str | None = None  # the chosen one; empty for none
     camera: bool | None = None  # whether its camera is open
+    at_s: float | None = None  # of a recording: where to go on
+    speed: float | None = None
+    play: bool | None = None
 
 
 class Now(NamedTuple):
@@ -88,13 +96,16 @@ class Now(NamedTuple):
     help: tuple[Arrow, ...] = ()
     snapshot: Snapshot = Snapshot()
     traffic: Traffic | None = None
+    playing: Playing | None = None  # None: live
 
 
 class Page:
     """One open page: what it was sent, and what it wants."""
 
-    def __init__(self, channel: web.WebSocketResponse, feed: Feed) -> None:
-        self._channel, self._feed = channel, feed
+    def __init__(
+        self, channel: web.WebSocketResponse, feed: Feed, playback: Playback | None = None
+    ) -> None:
+        self._channel, self._feed, self._playback = channel, feed, playback
         self._robots: Mapping[str, RobotPicture] = {}
         self._help: object = None
         self._detail: RobotDetail | None = None
@@ -121,6 +132,8 @@ class Page:
     def _handle(self, request: Request) -> None:
         if request.ack is not None:
             self._acknowledged = min(max(self._acknowledged, request.ack), self._sent)
+        if self._playback is not None:
+            self._playback.control(request.at_s, request.speed, request.play)
         if request.robot is not None:
             self._robot, self._detail = request.robot, None
         if request.camera is not None or request.robot is not None:
@@ -134,6 +147,11 @@ class Page:
                 if name:
                     self._feed.watch_camera(name, more)
             self._camera, self._frame_ns = robot, 0
+
+    async def begin(self, hello: TeamPicture) -> None:
+        """Sends what a page is told first, and again after a jump of a recording."""
+        self._robots, self._help, self._detail, self._frame_ns = {}, None, None, 0
+        await self._send(hello)
 
     async def send(self, now: Now) -> None:
         """Sends what has changed, unless the page still works on the frames before."""
@@ -154,7 +172,10 @@ class Page:
         help_now = None if now.help == self._help else now.help
         self._robots, self._help, self._sent = now.pictures, now.help, self._sent + 1
         number, at_s = self._sent, round(now.at_s, 3)
-        await self._send(Frame(number, at_s, now.notice, robots, removed, help_now, self._skipped))
+        play = None if now.playing is None else (now.playing.speed, now.playing.is_playing)
+        await self._send(
+            Frame(number, at_s, now.notice, robots, removed, help_now, self._skipped, play)
+        )
 
     async def _send_camera_frame(self) -> None:
         frame = self._feed.frame(self._camera) if self._camera else None
@@ -176,7 +197,7 @@ class Server:
     def __init__(self, shown: ShownTeam, feed: Feed, listen: Listen) -> None:
         self._shown, self._feed, self._listen = shown, feed, listen
         self._pages: set[Page] = set()
-        self._began_s = feed.now_s()
+        self._began_s = 0.0 if shown.playback is not None else feed.now_s()
         self._now, self._traffic_s = Now(), -TRAFFIC_S
         folder = files("cpcbl_launch.views.web")
         self._files = {name: (folder / "page" / name).read_bytes() for name in PAGE}
@@ -212,7 +233,7 @@ class Server:
         channel = web.WebSocketResponse(
             heartbeat=10.0, max_msg_size=LARGEST_REQUEST, compress=False, timeout=1.0
         )
-        page = Page(channel, self._feed)
+        page = Page(channel, self._feed, self._shown.playback)
         self._pages.add(page)  # before the first pause: no other may take its place
         sender: asyncio.Task[None] | None = None
         try:
@@ -232,19 +253,28 @@ class Server:
         return channel
 
     async def _send_frames(self, page: Page, channel: web.WebSocketResponse) -> None:
-        history = {
-            name: [sample._replace(at_s=sample.at_s - self._began_s) for sample in samples]
-            for name, samples in self._feed.history().items()
-        }
-        hello = team_picture(self._shown.team, self._shown.name, history)
+        jumps = -1
         try:
-            await channel.send_str(msgspec.json.encode(hello).decode())
             while True:
-                await page.send(self._now)
+                now = self._now
+                if jumps != (jumps := now.playing.jumps if now.playing else 0):
+                    await page.begin(self._hello())
+                await page.send(now)
                 await page.due.wait()
                 page.due.clear()
         except ConnectionError:
             return  # its reader notices too
+
+    def _hello(self) -> TeamPicture:
+        history = {
+            name: [sample._replace(at_s=sample.at_s - self._began_s) for sample in samples]
+            for name, samples in self._feed.history().items()
+        }
+        playback = self._shown.playback
+        recorded = None
+        if playback is not None:
+            recorded = RecordingPicture(playback.duration_s, playback.begin_ns * 1e-9)
+        return team_picture(self._shown.team, self._shown.name, history, recorded)
 
     async def close_pages(self) -> None:
         """Tells all pages that the view has ended."""
@@ -263,21 +293,24 @@ class Server:
             await asyncio.sleep(due_s - loop.time())
 
     def _next(self) -> Now:
-        feed, shown, before = self._feed, self._shown, self._now
+        feed, shown, before, playing = self._feed, self._shown, self._now, None
+        if shown.playback is not None and (playing := shown.playback.playing) is None:
+            return before  # it jumps
         now_s, snapshot = feed.now_s(), feed.snapshot()
         pictures = robot_pictures(snapshot, feed.named, now_s, self._began_s, shown.team)
         traffic = before.traffic
-        if traffic is None or now_s - self._traffic_s >= TRAFFIC_S:
+        if traffic is None or abs(now_s - self._traffic_s) >= TRAFFIC_S:
             self._traffic_s = now_s
             arrivals = {n: r.arrivals for n, r in snapshot.robots.items() if r.arrivals}
             traffic = traffic_from_statuses(shown.name, (), arrivals, self._began_s, now_s)
         return Now(
             now_s - self._began_s,
-            notice_text(snapshot, shown.name, shown.where, now_s),
+            playing.problem if playing else notice_text(snapshot, shown.name, shown.where, now_s),
             pictures,
             help_arrows(traffic, pictures),
             snapshot,
             traffic,
+            playing,
         )
 
 

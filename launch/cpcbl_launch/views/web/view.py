@@ -2,9 +2,12 @@
 
 import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
+from cpcbl_launch.recordings.merge import indexed_recording
 from cpcbl_launch.views.web.address import Listen
 from cpcbl_launch.views.web.feed import Feed
+from cpcbl_launch.views.web.playback import Playback
 from cpcbl_launch.views.web.server import ShownTeam, serve
 from cpcbl_transport.security import Link
 from cpcbl_transport.zenoh_bus import BusError, ZenohBus, open_bus
@@ -59,3 +62,16 @@ def _open_bus(
             reason = str(error)
             say(reason[:1].upper() + reason[1:])
     return None
+
+
+def view_recording(
+    run: Path, listen: Listen, stop: Callable[[], bool], show_address: Callable[[str, str], None]
+) -> None:
+    """Serves a recorded run until `stop()`. Raises LogError, InputError."""
+    with indexed_recording(run) as recording:
+        playback = Playback(recording)
+        shown = ShownTeam(recording.team.name, str(run), recording.team, playback)
+        with playback.running(), serve(shown, playback.feed, listen) as address:
+            show_address(shown.name, address)
+            while not stop():
+                time.sleep(REFRESH_S)

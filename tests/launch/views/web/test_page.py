@@ -13,9 +13,10 @@ import pytest
 from support.chromium import PROGRAM as CHROMIUM
 from support.chromium import Tab, opened
 from support.processes import pids_of
+from support.simulated import simulate_recorded
 
 from cpcbl_launch.run.processes import PROGRAM
-from cpcbl_launch.team.file import builtin_path
+from cpcbl_launch.team.file import builtin_path, load_team
 
 pytestmark = [
     pytest.mark.trial,
@@ -132,5 +133,39 @@ def test_shows_what_a_camera_sees_and_only_while_it_is_open(tmp_path: Path) -> N
             await tab.evaluate("document.querySelector('#camera').click()")
             await tab.wait_for("document.querySelector('#picture').hidden")
             assert tab.errors == []
+
+    asyncio.run(test())
+
+
+def test_a_recording_is_scrubbed_on_the_same_page(tmp_path: Path) -> None:
+    recorded = tmp_path / "demo.mcap"
+    simulate_recorded(load_team(builtin_path("demo")), 1, 20.0, recorded)
+    jump = "(() => {const s = document.querySelector('#seek'); s.value = %s; s.oninput();"
+    jump += " s.onchange();})()"
+    time_is = "document.querySelector('#time').textContent.startsWith('%s')"
+
+    async def test() -> None:
+        command = [*PROGRAM, "view", str(recorded), "--listen", "127.0.0.1:0"]
+        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as view:
+            assert view.stdout is not None
+            line = await asyncio.to_thread(view.stdout.readline)
+            async with opened(line.split()[-1], tmp_path) as tab:
+                await tab.wait_for(f"Object.values({STATES}).filter((s) => s === 'ok').length > 2")
+                await tab.wait_for("!document.querySelector('#player').hidden")
+                await tab.evaluate("document.querySelector('#play').click()")
+                await tab.wait_for("document.querySelector('#play').textContent === 'Play'")
+                await tab.evaluate("document.querySelector('tr[data-robot=scout] button').click()")
+                for at_s, shown in ((15, "0:15"), (4, "0:04"), (18, "0:18")):
+                    await tab.evaluate(jump % at_s)
+                    await tab.wait_for(time_is % shown)
+                    await tab.wait_for("document.querySelector('#facts').textContent.length > 99")
+                await tab.wait_for("document.querySelector('#link').textContent === 'recording'")
+                await tab.save_screenshot(tmp_path / "recording.png")
+                await tab.resize(360, 740, is_dark=True)
+                await tab.wait_for("document.documentElement.scrollWidth <= 360")
+                assert tab.errors == []
+            view.send_signal(signal.SIGINT)
+            assert await asyncio.to_thread(view.wait, 60.0) == 130
+        assert (tmp_path / "recording.png").stat().st_size > 20_000
 
     asyncio.run(test())

@@ -2,6 +2,7 @@
 import { forgetInks, ink } from "./colours.js";
 import { FieldMap } from "./field.js";
 import { Panel } from "./panel.js";
+import { Player } from "./player.js";
 import { Plot } from "./plots.js";
 
 const TRAIL_S = 30, PLOT_S = 60, SLOW_MS = 500, LEFT_OUT_MS = 5000;
@@ -23,6 +24,7 @@ const choose = (name) => {
 };
 const map = new FieldMap($("map"), team, robots, choose, () => redraw());
 const panel = new Panel(team, robots, choose, (open) => say({ camera: open }));
+const player = new Player((request) => say(request));
 stats.marks = () => team.landmarks.map(([, x, y]) => map.pixels(x, y));
 const plots = [new Plot($("sigma"), robots, team, 3, 1e-4), new Plot($("error"), robots, team, 4, 1e-3)];
 
@@ -51,6 +53,7 @@ function take(message) {
 }
 
 function start(message) {
+  const isSame = team.name === message.team; // after a jump, or the connection is back
   Object.assign(team, { name: message.team, landmarks: message.landmarks, walls: message.walls, cameras: message.cameras, help: [] });
   robots.clear();
   stats.lastMs = null;
@@ -60,8 +63,9 @@ function start(message) {
   }
   $("team").textContent = team.name;
   document.title = `${team.name} · cpcbl-team view`;
+  player.start(message.recording);
   panel.clear();
-  map.fit();
+  if (!isSame) map.fit();
   if (team.chosen) say({ robot: team.chosen, camera: panel.isCameraOpen });
 }
 
@@ -86,6 +90,7 @@ function frame(message) {
   }
   for (const name of message.removed) robots.delete(name);
   if (message.help) team.help = message.help;
+  player.show(message.at_s, message.play);
   notice(message.notice);
   const now = performance.now();
   if (message.skipped > stats.skipped) leftOut.push([now, message.skipped - stats.skipped]);
@@ -161,9 +166,10 @@ function notice(text) {
 }
 
 function setLink(isLive) {
+  const kind = player.recording ? "recording" : "live";
   $("link").classList.toggle("live", isLive);
   const recent = leftOut.filter(([at]) => performance.now() - at < LEFT_OUT_MS).reduce((n, [, more]) => n + more, 0);
-  setText($("link"), !isLive ? "not connected" : recent ? `live, ${recent} ${recent === 1 ? "frame" : "frames"} left out` : "live");
+  setText($("link"), !isLive ? "not connected" : recent ? `${kind}, ${recent} ${recent === 1 ? "frame" : "frames"} left out` : kind);
 }
 
 matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { forgetInks(); redraw(); });

@@ -108,7 +108,7 @@ export class Panel {
     if (r?.why && !d.problems.includes(r.why)) parts.push(paragraph(`${r.state}: ${r.why}`, `s-${r.state}`));
     if (d.problems.length) parts.push(heading("Problems"), list(d.problems));
     const place = r?.pose ? `x ${number(r.pose[0], 2)} m, y ${number(r.pose[1], 2)} m, heading ${((r.pose[2] * 180) / Math.PI).toFixed(0)}°` : "no pose";
-    parts.push(heading("Pose"), paragraph(`${place}; heading σ ${number(d.heading_sigma_deg, 1)}°; sees ${r?.sees.map((s) => s[0]).join(", ") || "nothing"}`));
+    parts.push(heading("Pose"), paragraph(`${place}; heading σ ${number(d.heading_sigma_deg, 1)}°; sees ${r?.sees?.map((s) => s[0]).join(", ") || "nothing"}`));
     parts.push(heading("Inputs"), this.inputs(d));
     const refused = Object.entries(d.refused).sort((a, b) => b[1] - a[1]);
     parts.push(heading("Refused"), refused.length ? grid([], refused.map(([why, n]) => [words(why), n])) : paragraph("nothing", "none"));
