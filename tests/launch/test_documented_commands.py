@@ -50,6 +50,8 @@ ALIVE = r" ok\b"  # the state of a robot in the live table
 EXPERIMENT = "written: "
 BUDGET = Way(EXPERIMENT, "long", "--team-size 2 --seeds 1")
 SHORT = "--duration 12"
+LIAR, TABLE_1 = ("one liar, 2 honest",), ("errors at waypoints",)
+OVAL = ("navigator, 5 loops, 20 runs",)
 FIGURE_7 = "navigator, 5 loops, 50 runs", "navigator with a camera, 5 loops"
 GUEST = "before, during and after guest"
 TRIPOD = "tripod took part", f"{GUEST} tripod"
@@ -110,23 +112,17 @@ WAYS = {
     "cpcbl-team experiment budget --team-size 5 --world chain --seeds 6": BUDGET,
     "cpcbl-team experiment budget --world chain": BUDGET,
     "cpcbl-team experiment budget MRCLAM6": Way(EXPERIMENT, "long"),
-    "cpcbl-team experiment circular-vs-oval": Way(
-        EXPERIMENT, "trial", "--seeds 1", shows=("navigator, 5 loops, 20 runs",)
-    ),
+    "cpcbl-team experiment circular-vs-oval": Way(EXPERIMENT, "trial", "--seeds 1", shows=OVAL),
     "cpcbl-team experiment figure7": Way(EXPERIMENT, "trial", "--seeds 1", shows=FIGURE_7[:1]),
     "cpcbl-team experiment figure7-cameras": Way(
         EXPERIMENT, "long", "--seeds 1", shows=FIGURE_7[1:]
     ),
     "cpcbl-team experiment liars": Way(EXPERIMENT, "long", "--seeds 1"),
-    "cpcbl-team experiment liars --seeds 4": Way(
-        EXPERIMENT, "long", "--seeds 1", shows=("one liar, 2 honest",)
-    ),
+    "cpcbl-team experiment liars --seeds 4": Way(EXPERIMENT, "long", "--seeds 1", shows=LIAR),
     "cpcbl-team experiment one-way-vs-both": Way(
         EXPERIMENT, "trial", "--team-sizes 2 --seeds 1", shows=("robots that move",)
     ),
-    "cpcbl-team experiment table1": Way(
-        EXPERIMENT, "long", "--seeds 1", shows=("errors at waypoints",)
-    ),
+    "cpcbl-team experiment table1": Way(EXPERIMENT, "long", "--seeds 1", shows=TABLE_1),
     "cpcbl-team experiment table1 --seeds 20": Way(EXPERIMENT, "long", "--seeds 2"),
     "cpcbl-team experiment worlds": Way(EXPERIMENT, "long", "--seeds 1"),
     "cpcbl-team bridge access team.toml > access.json5": Way("access_control"),
@@ -152,7 +148,6 @@ WAYS = {
         "rover took part", "trial", "--duration 4", beside="blind", shows=(f"{GUEST} rover",)
     ),
     "cpcbl-team merge RUN": Way("written: RUN/run.mcap"),
-    "cpcbl-team merge run.mcap --output shown.mcap": Way("written: shown.mcap"),
     "cpcbl-team observer blind tripod --at 4.5,6,-90 --connect ENDPOINT --duration 20": Way(
         "tripod took part", "trial", "--duration 4", beside="blind", shows=TRIPOD
     ),
