@@ -13,14 +13,14 @@ from statistics import median
 from tempfile import TemporaryDirectory
 
 import msgspec
-from support.paired import changed_world, pair, simulate_world
+from support.paired import SECONDS, SIZE, changed_world, pair, simulate_world
 
 from cpcbl_launch.lab.seeds import Workers, run_seeds
 from cpcbl_launch.lab.what_if.comparison import what_if
 from cpcbl_launch.lab.what_if.inputs import read_inputs
 from cpcbl_launch.reporting.recorder import Report, mean_score
 
-KINDS = {"open": (True, 0.0), "open, late": (True, 0.1), "closed": (False, 0.0)}
+KINDS = {"open": (True, 0.0), "late": (True, 0.1), "closed": (False, 0.0)}
 """Whether robots drive as commanded beforehand, and how late a message is at most (s)."""
 SHARE = 0.1  # of the true change, within which it is to be foretold
 LEAST = 0.05  # of the RMSE: smaller changes are judged by their difference in metres alone
@@ -55,9 +55,9 @@ class Pair(msgspec.Struct, frozen=True, kw_only=True):
         return abs(self.miss_m) <= SHARE * max(abs(self.change_m), LEAST * self.before_m)
 
 
-def measure(kind: str, number: int) -> Pair:
-    """One pair of this kind."""
-    world, change = pair(number, *KINDS[kind])
+def measure(kind: str, number: int, size: int, duration_s: float) -> Pair:
+    """One pair of this kind, of so many robots for so many seconds."""
+    world, change = pair(number, *KINDS[kind], size, duration_s)
     with TemporaryDirectory() as folder:
         before = simulate_world(world, folder=Path(folder) / "run")
         result = what_if(read_inputs(Path(folder) / "run"), change, where=Workers(1))
@@ -96,12 +96,15 @@ def rows(pairs: Sequence[Pair]) -> list[str]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--pairs", type=int, default=40)
-    parser.add_argument("--kinds", default=",".join(KINDS).replace("open, late", "late"))
+    parser.add_argument("--kinds", default=",".join(KINDS))
+    parser.add_argument("--team-size", type=int, default=SIZE)
+    parser.add_argument("--duration", type=float, default=SECONDS)
     parser.add_argument("--jobs", type=int)
     parser.add_argument("--output", type=Path, default=Path("build/what_if.json"))
     chosen = parser.parse_args()
-    kinds = [{"late": "open, late"}.get(name, name) for name in chosen.kinds.split(",")]
-    tasks = [(kind, number) for kind in kinds for number in range(1, chosen.pairs + 1)]
+    how = chosen.team_size, chosen.duration
+    numbers = range(1, chosen.pairs + 1)
+    tasks = [(kind, number, *how) for kind in chosen.kinds.split(",") for number in numbers]
     pairs = run_seeds(measure, tasks, Workers(chosen.jobs))
     chosen.output.write_bytes(msgspec.json.format(msgspec.json.encode(pairs), indent=1))
     sys.stdout.write("\n".join(rows(pairs)) + "\n")

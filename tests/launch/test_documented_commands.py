@@ -17,7 +17,7 @@ from typing import Literal, NamedTuple
 
 import pytest
 from support.documented_files import write_files
-from support.documents import ROOT, blocks, commands, headers
+from support.documents import ROOT, blocks, commands, headers, written_files
 from support.processes import command_line, eventually
 from support.programs import Program
 
@@ -46,10 +46,13 @@ class Way(NamedTuple):
 
 LIVE = Way("", "trial", until_sigint=True, codes=(ENDED_BY_SIGINT,))
 WATCHED = LIVE._replace(says="watched for", beside="team.toml")
+CONNECTED = LIVE._replace(says="r[13]: connected to team lab", beside="router")
 ALIVE = r" ok\b"  # the state of a robot in the live table
 EXPERIMENT = "written: "
+ONE_SEED = Way(EXPERIMENT, "long", "--seeds 1")
 BUDGET = Way(EXPERIMENT, "long", "--team-size 2 --seeds 1")
 SHORT = "--duration 12"
+LEDGER = "run, 60 s", "what each was worth"
 LIAR, TABLE_1 = ("one liar, 2 honest",), ("errors at waypoints",)
 OVAL = ("navigator, 5 loops, 20 runs",)
 FIGURE_7 = "navigator, 5 loops, 50 runs", "navigator with a camera, 5 loops"
@@ -124,7 +127,7 @@ WAYS = {
     ),
     "cpcbl-team experiment table1": Way(EXPERIMENT, "long", "--seeds 1", shows=TABLE_1),
     "cpcbl-team experiment table1 --seeds 20": Way(EXPERIMENT, "long", "--seeds 2"),
-    "cpcbl-team experiment worlds": Way(EXPERIMENT, "long", "--seeds 1"),
+    "cpcbl-team experiment worlds": ONE_SEED,
     "cpcbl-team bridge access team.toml > access.json5": Way("access_control"),
     "cpcbl-team bridge ros2 team.toml": LIVE._replace(says="in ROS 2 at", beside="router"),
     "cpcbl-team gateway team.toml": LIVE._replace(
@@ -152,12 +155,8 @@ WAYS = {
         "tripod took part", "trial", "--duration 4", beside="blind", shows=TRIPOD
     ),
     "cpcbl-team report RUN -o report.html": Way("written: report.html"),
-    "cpcbl-team robot team.toml r1": LIVE._replace(
-        says="r1: connected to team lab", beside="router"
-    ),
-    "cpcbl-team robot team.toml r3 --connect tcp/10.2.0.1:7447": LIVE._replace(
-        says="r3: connected to team lab", beside="router"
-    ),
+    "cpcbl-team robot team.toml r1": CONNECTED,
+    "cpcbl-team robot team.toml r3 --connect tcp/10.2.0.1:7447": CONNECTED,
     "cpcbl-team router --config": LIVE._replace(says="listens at", more="router.json5"),
     "cpcbl-team router --config router.json5": LIVE._replace(says="listens at"),
     "cpcbl-team router team.toml": LIVE._replace(says="router of team lab listens at"),
@@ -191,6 +190,9 @@ WAYS = {
     ),
     "cpcbl-team up team.toml": LIVE._replace(says=ALIVE),
     "cpcbl-team up team.toml --duration 120 --record run.mcap": Way(SIMULATED, "trial", SHORT),
+    "cpcbl-team what-if RUN": Way("worth", "trial", "--duration 1", shows=LEDGER),
+    "cpcbl-team what-if RUN --without observer": Way("apart", more="--duration 1 --jobs 1"),
+    "cpcbl-team what-if MRCLAM6 --duration 60 --hide 7": Way("apart", "trial", "--duration 2"),
     "cpcbl-team view RUN": LIVE._replace(says="view of team demo", more="--listen :0"),
     "cpcbl-team view team.toml": LIVE._replace(
         says="view of team lab", more="--listen :0", beside="router"
@@ -205,6 +207,7 @@ WAYS = {
         instead=("'.[security]'", f"'{ROOT}[security]'"),
     ),
 }
+CLUSTER = "tests/launch/lab/test_seeds.py"
 IN_CONTAINERS = "tests/launch/run/test_containers.py"
 SNIPPETS = "tests/launch/test_documented_snippets.py"
 CURL = 'curl -H "Authorization: Bearer $token" http://127.0.0.1:8447'
@@ -222,6 +225,9 @@ ELSEWHERE = {
     "docker-compose -f docker/compose.yaml up": (
         f"{IN_CONTAINERS}::test_the_committed_compose_file_runs_and_a_robot_that_crashes_comes_back"
     ),
+    "cpcbl-team experiment worlds --cluster": f"{CLUSTER}::cluster=address",
+    "dask ": f"{CLUSTER}::def dask",
+    "pip install '.[cluster]'": "Makefile::.[dev]",
     "docker/base-image.sh cpcbl-base": "tests/support/docker.py::base-image.sh",
     "export CPCBL_BASE_IMAGE=cpcbl-base": "tests/support/docker.py::LOCAL_BASE",
     "pip install '.[ros2,camera]'": "Makefile::.[dev]",
@@ -318,11 +324,6 @@ def test_a_documented_command_runs(command: str, place: Path) -> None:
         (place / output).write_text(ran.stdout)
     for name in written_files(line):
         assert (place / name).stat().st_size, name
-
-
-def written_files(line: str) -> list[str]:
-    """Files that a command says that it writes."""
-    return re.findall(r"(?:--picture|--record|--preview|--report|--markdown|>) (\S+)", line)
 
 
 @contextmanager
