@@ -13,10 +13,10 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Literal, NamedTuple
 
 import pytest
 from support.documented_files import write_files
+from support.documented_ways import ALIVE, LIVE, Way, Where
 from support.documents import ROOT, blocks, commands, headers
 from support.processes import command_line, eventually
 from support.programs import Program
@@ -25,27 +25,9 @@ from cpcbl_launch.run.processes import PROGRAM
 from cpcbl_launch.run.up import free_endpoint
 
 ENDPOINT = re.compile(r"(?<=--connect )(tcp/[\d.:]+|ENDPOINT)")
-ENDED_BY_SIGINT = 130
 PATIENCE_S = 60.0
-Where = Literal["test", "trial", "long"]
 
 
-class Way(NamedTuple):
-    """How a documented command runs here. It ends by itself, or after its sign of life."""
-
-    says: str  # regular expression: in what it prints
-    where: Where = "test"
-    more: str = ""  # options that make it short, or take another port
-    instead: tuple[str, str] = ("", "")  # a piece of it, and what takes its place
-    first: str = ""  # what makes its files, when no small file is in `documented_files`
-    beside: str = ""  # the team that runs meanwhile
-    until_sigint: bool = False
-    codes: tuple[int, ...] = (0,)
-    shows: tuple[str, ...] = ()  # beginnings of the outputs in the docs that have its tables
-
-
-LIVE = Way("", "trial", until_sigint=True, codes=(ENDED_BY_SIGINT,))
-ALIVE = r" ok\b"  # the state of a robot in the live table
 EXPERIMENT = "written: "
 SHORT = "--duration 12"
 FIGURE_7 = "navigator, 5 loops, 50 runs", "navigator with a camera, 5 loops"
@@ -170,10 +152,10 @@ WAYS = {
     "cpcbl-team router team.toml --listen tcp/0.0.0.0:7447 --print-config > router.json5": Way(
         "zenohd -c FILE"
     ),
-    "cpcbl-team replay run": Way(
-        ": equal to the bit: ", first="cpcbl-team simulate demo --duration 3 --record run"
+    "cpcbl-team replay run": Way(": equal to the bit: "),
+    "cpcbl-team robot team.toml r1 --record run": LIVE._replace(
+        says="r1: connected to team lab", beside="router"
     ),
-    "cpcbl-team robot team.toml r1 --record run": LIVE,
     "cpcbl-team simulate demo --duration 20 --record run": Way(SIMULATED, "trial"),
     "cpcbl-team simulate demo --picture docs/demo.png": Way(SIMULATED, "trial", SHORT),
     "cpcbl-team traffic demo --connect tcp/127.0.0.1:32885": Way(
@@ -187,6 +169,7 @@ WAYS = {
         SIMULATED, "trial", f"{SHORT} --view-listen :0", shows=("view of team demo",)
     ),
     "cpcbl-team up blind --duration 60": LIVE._replace(says=ALIVE),
+    "cpcbl-team up demo --duration 20 --record run": LIVE._replace(says=ALIVE),
     "cpcbl-team up demo --duration 26 --bytes-per-s 100 --messages-per-minute 120": LIVE._replace(
         says=ALIVE
     ),
@@ -242,6 +225,8 @@ LEFT_OUT = {
     "for f in nao": "it arranges these pictures",
 }
 OUTPUT_ELSEWHERE = {
+    "navigator (e09a9fce): ": "tests/launch/recordings/test_replay.py::equal to the bit: ",
+    "differs: patrol (0), step": "tests/launch/recordings/test_replay.py::patrol (0), step ",
     "rendered frames: 3000, seed 1": "tests/benchmarks/test_detection.py::benchmark_shows",
     "duckiebot: 15 pictures": "tests/benchmarks/test_pictures.py::test_the_benchmark_shows",
     "team.toml: warning: robots.r1": f"{SNIPPETS}::test_the_warnings_of_the_page",

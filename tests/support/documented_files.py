@@ -17,6 +17,7 @@ from cpcbl_team.geometry import Pose2
 from support.board_pictures import board_pictures
 from support.logs import write_log
 from support.processes import command_line
+from support.simulated import record_run
 
 TEAM = """name = "lab"
 [map.landmarks]
@@ -134,6 +135,10 @@ def _keys(path: Path) -> None:
     assert command_line("keys", path.with_name("team.toml")).returncode == 0
 
 
+def _run(path: Path) -> None:
+    record_run(path.with_name("run"), parse_team(TEAM), 1, 2.0)
+
+
 MAKERS: dict[str, Callable[[Path], object]] = {
     **dict.fromkeys(("MRCLAM2", "MRCLAM4", "MRCLAM6"), _log),
     "calibrated.toml": lambda path: path.write_text(builtin_path("mrclam").read_text()),
@@ -145,6 +150,7 @@ MAKERS: dict[str, Callable[[Path], object]] = {
     "drive.mp4": _film,
     "router.json5": _router_config,
     "--re": _keys,  # --renew, --revoke
+    "replay run": _run,
 }
 
 
