@@ -13,11 +13,11 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Literal, NamedTuple
 
 import pytest
 from support.documented_files import write_files
-from support.documents import ROOT, blocks, commands, headers, written_files
+from support.documented_ways import ALIVE, LIVE, Way, Where
+from support.documents import ROOT, blocks, commands, headers
 from support.processes import command_line, eventually
 from support.programs import Program
 
@@ -25,31 +25,11 @@ from cpcbl_launch.run.processes import PROGRAM
 from cpcbl_launch.run.up import free_endpoint
 
 ENDPOINT = re.compile(r"(?<=--connect )(tcp/[\d.:]+|ENDPOINT)")
-ENDED_BY_SIGINT = 130
 PATIENCE_S = 60.0
-Where = Literal["test", "trial", "long"]
 
 
-class Way(NamedTuple):
-    """How a documented command runs here. It ends by itself, or after its sign of life."""
-
-    says: str  # regular expression: in what it prints
-    where: Where = "test"
-    more: str = ""  # options that make it short, or take another port
-    instead: tuple[str, str] = ("", "")  # a piece of it, and what takes its place
-    first: str = ""  # what makes its files, when no small file is in `documented_files`
-    beside: str = ""  # the team that runs meanwhile
-    until_sigint: bool = False
-    codes: tuple[int, ...] = (0,)
-    shows: tuple[str, ...] = ()  # beginnings of the outputs in the docs that have its tables
-
-
-LIVE = Way("", "trial", until_sigint=True, codes=(ENDED_BY_SIGINT,))
 WATCHED = LIVE._replace(says="watched for", beside="team.toml")
-CONNECTED = LIVE._replace(says="r[13]: connected to team lab", beside="router")
-ALIVE = r" ok\b"  # the state of a robot in the live table
 EXPERIMENT = "written: "
-ONE_SEED = Way(EXPERIMENT, "long", "--seeds 1")
 BUDGET = Way(EXPERIMENT, "long", "--team-size 2 --seeds 1")
 SHORT = "--duration 12"
 LEDGER = "run, 60 s", "what each was worth"
@@ -107,7 +87,7 @@ WAYS = {
     "cpcbl-team compose team.toml": Way("robot-r1:"),
     "cpcbl-team compose team.toml > compose.yaml": Way("robot-r1:"),
     "cpcbl-team doctor team.toml": Way("r1", "trial", beside="team.toml", codes=(0, 1)),
-    "cpcbl-team evaluate RUN": Way("RMSE m"),
+    "cpcbl-team evaluate run": Way("RMSE m"),
     "cpcbl-team evaluate calibrated.toml MRCLAM6": Way("RMSE m"),
     "cpcbl-team evaluate mrclam MRCLAM6 --blind 3,4,5 --collaboration none": Way("RMSE m"),
     "cpcbl-team evaluate mrclam MRCLAM6 --blind 3,4,5 --yardstick": Way("centralized EKF"),
@@ -127,7 +107,7 @@ WAYS = {
     ),
     "cpcbl-team experiment table1": Way(EXPERIMENT, "long", "--seeds 1", shows=TABLE_1),
     "cpcbl-team experiment table1 --seeds 20": Way(EXPERIMENT, "long", "--seeds 2"),
-    "cpcbl-team experiment worlds": ONE_SEED,
+    "cpcbl-team experiment worlds": Way(EXPERIMENT, "long", "--seeds 1"),
     "cpcbl-team bridge access team.toml > access.json5": Way("access_control"),
     "cpcbl-team bridge ros2 team.toml": LIVE._replace(says="in ROS 2 at", beside="router"),
     "cpcbl-team gateway team.toml": LIVE._replace(
@@ -150,13 +130,17 @@ WAYS = {
     " --connect ENDPOINT --duration 20": Way(
         "rover took part", "trial", "--duration 4", beside="blind", shows=(f"{GUEST} rover",)
     ),
-    "cpcbl-team merge RUN": Way("written: RUN/run.mcap"),
+    "cpcbl-team merge run": Way("written: run/run.mcap"),
     "cpcbl-team observer blind tripod --at 4.5,6,-90 --connect ENDPOINT --duration 20": Way(
         "tripod took part", "trial", "--duration 4", beside="blind", shows=TRIPOD
     ),
-    "cpcbl-team report RUN -o report.html": Way("written: report.html"),
-    "cpcbl-team robot team.toml r1": CONNECTED,
-    "cpcbl-team robot team.toml r3 --connect tcp/10.2.0.1:7447": CONNECTED,
+    "cpcbl-team report run -o report.html": Way("written: report.html"),
+    "cpcbl-team robot team.toml r1": LIVE._replace(
+        says="r1: connected to team lab", beside="router"
+    ),
+    "cpcbl-team robot team.toml r3 --connect tcp/10.2.0.1:7447": LIVE._replace(
+        says="r3: connected to team lab", beside="router"
+    ),
     "cpcbl-team router --config": LIVE._replace(says="listens at", more="router.json5"),
     "cpcbl-team router --config router.json5": LIVE._replace(says="listens at"),
     "cpcbl-team router team.toml": LIVE._replace(says="router of team lab listens at"),
@@ -166,10 +150,10 @@ WAYS = {
     "cpcbl-team router team.toml --listen tcp/0.0.0.0:7447 --print-config > router.json5": Way(
         "zenohd -c FILE"
     ),
-    "cpcbl-team replay run": Way(
-        ": equal to the bit: ", first="cpcbl-team simulate demo --duration 3 --record run"
+    "cpcbl-team replay run": Way(": equal to the bit: "),
+    "cpcbl-team robot team.toml r1 --record run": LIVE._replace(
+        says="r1: connected to team lab", beside="router"
     ),
-    "cpcbl-team robot team.toml r1 --record run": LIVE,
     "cpcbl-team simulate demo --duration 20 --record run": Way(SIMULATED, "trial"),
     "cpcbl-team simulate demo --picture docs/demo.png": Way(SIMULATED, "trial", SHORT),
     "cpcbl-team traffic demo --connect tcp/127.0.0.1:32885": Way(
@@ -181,6 +165,7 @@ WAYS = {
         SIMULATED, "trial", f"{SHORT} --view-listen :0", shows=("view of team demo",)
     ),
     "cpcbl-team up blind --duration 60": LIVE._replace(says=ALIVE),
+    "cpcbl-team up demo --duration 20 --record run": LIVE._replace(says=ALIVE),
     "cpcbl-team up demo --duration 26 --bytes-per-s 100 --messages-per-minute 120": LIVE._replace(
         says=ALIVE
     ),
@@ -193,7 +178,7 @@ WAYS = {
     "cpcbl-team what-if RUN": Way("worth", "trial", "--duration 1", shows=LEDGER),
     "cpcbl-team what-if RUN --without observer": Way("apart", more="--duration 1 --jobs 1"),
     "cpcbl-team what-if MRCLAM6 --duration 60 --hide 7": Way("apart", "trial", "--duration 2"),
-    "cpcbl-team view RUN": LIVE._replace(says="view of team demo", more="--listen :0"),
+    "cpcbl-team view run": LIVE._replace(says="view of team lab", more="--listen :0"),
     "cpcbl-team view team.toml": LIVE._replace(
         says="view of team lab", more="--listen :0", beside="router"
     ),
@@ -244,6 +229,8 @@ LEFT_OUT = {
     "for f in nao": "it arranges these pictures",
 }
 OUTPUT_ELSEWHERE = {
+    "navigator (e09a9fce): ": "tests/launch/recordings/test_replay.py::equal to the bit: ",
+    "differs: patrol (0), step": "tests/launch/recordings/test_replay.py::patrol (0), step ",
     "rendered frames: 3000, seed 1": "tests/benchmarks/test_detection.py::benchmark_shows",
     "duckiebot: 15 pictures": "tests/benchmarks/test_pictures.py::test_the_benchmark_shows",
     "team.toml: warning: robots.r1": f"{SNIPPETS}::test_the_warnings_of_the_page",
@@ -324,6 +311,11 @@ def test_a_documented_command_runs(command: str, place: Path) -> None:
         (place / output).write_text(ran.stdout)
     for name in written_files(line):
         assert (place / name).stat().st_size, name
+
+
+def written_files(line: str) -> list[str]:
+    """Files that a command says that it writes."""
+    return re.findall(r"(?:--picture|--record|--preview|--report|--markdown|>) (\S+)", line)
 
 
 @contextmanager

@@ -11,13 +11,13 @@ import numpy as np
 from cpcbl_agents.vision.camera import Camera
 from cpcbl_launch.calibration.lens import parse_board
 from cpcbl_launch.simulation.camera.render import Light, Scene, SceneRobot, render
-from cpcbl_launch.team.file import builtin_path, load_team, parse_team
+from cpcbl_launch.team.file import builtin_path, parse_team
 from cpcbl_team.config import CameraSettings
 from cpcbl_team.geometry import Pose2
 from support.board_pictures import board_pictures
 from support.logs import write_log
 from support.processes import command_line
-from support.simulated import record_run, simulate_recorded
+from support.simulated import record_run
 
 TEAM = """name = "lab"
 [map.landmarks]
@@ -136,13 +136,10 @@ def _keys(path: Path) -> None:
 
 
 def _run(path: Path) -> None:
-    record_run(path, load_team(builtin_path("demo")), 1, 3.0, with_bus=True)
+    record_run(path.with_name("run"), parse_team(TEAM), 1, 2.0, with_bus=True)
 
 
-def _recording(path: Path) -> None:
-    simulate_recorded(load_team(builtin_path("demo")), 1, 3.0, path)
-
-
+READERS_OF_RUNS = "replay", "merge", "evaluate", "report", "view"
 MAKERS: dict[str, Callable[[Path], object]] = {
     **dict.fromkeys(("MRCLAM2", "MRCLAM4", "MRCLAM6"), _log),
     "calibrated.toml": lambda path: path.write_text(builtin_path("mrclam").read_text()),
@@ -153,9 +150,8 @@ MAKERS: dict[str, Callable[[Path], object]] = {
     "far.jpg": lambda path: _painted(path, red=(130, 190, 24, 24)),
     "drive.mp4": _film,
     "router.json5": _router_config,
-    "RUN": _run,
-    "run.mcap": _recording,
     "--re": _keys,  # --renew, --revoke
+    **dict.fromkeys([f"{word} run" for word in READERS_OF_RUNS], _run),
 }
 
 

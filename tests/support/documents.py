@@ -55,8 +55,3 @@ def headers(text: str) -> list[list[str]]:
     lines = text.splitlines()
     pairs = pairwise(lines)
     return [re.split(r"\s{2,}", line.strip()) for line, below in pairs if RULE.fullmatch(below)]
-
-
-def written_files(line: str) -> list[str]:
-    """Files that a command says that it writes."""
-    return re.findall(r"(?:--picture|--record|--preview|--report|--markdown|>) (\S+)", line)

@@ -19,6 +19,12 @@ if TYPE_CHECKING:
     from cpcbl_launch.recordings.read import Run
     from cpcbl_launch.recordings.replay import RunReplayed
 
+
+def _require_speed(option: str, speed: float) -> None:
+    if not speed > 0.0:
+        raise InputError(f"{option} {speed:g}: more than 0 times real time")
+
+
 RecordedRun = Annotated[Path, Argument(metavar="RUN", help="Folder of a run (up --record).")]
 Whom = Annotated[
     list[str] | None,
@@ -36,8 +42,17 @@ Until = Annotated[
         help="Seconds after the start of each process to end at; default: its end.",
     ),
 ]
+Dump = Annotated[
+    Path | None,
+    Option(callback=options.writable_file, help="File for the node's state at the end."),
+]
+FromState = Annotated[Path | None, Option("--from", help="State that --dump wrote, to begin with.")]
 Speed = Annotated[
-    float | None, Option(help="Times real time; default: as fast as the machine is; with --view 1.")
+    float | None,
+    Option(
+        callback=options.check_callback(_require_speed),
+        help="Times real time; default: as fast as the machine is; with --view 1.",
+    ),
 ]
 
 
@@ -45,13 +60,8 @@ def replay(
     run: RecordedRun,
     robot: Whom = None,
     until: Until = math.inf,
-    dump: Annotated[
-        Path | None,
-        Option(callback=options.writable_file, help="File for the node's state at the end."),
-    ] = None,
-    from_state: Annotated[
-        Path | None, Option("--from", help="State that --dump wrote, to begin with.")
-    ] = None,
+    dump: Dump = None,
+    from_state: FromState = None,
     speed: Speed = None,
     view: Annotated[bool, Option("--view", help="Serve a page that shows it.")] = False,
     view_listen: options.PageListen = None,
@@ -71,26 +81,20 @@ def replay(
     from cpcbl_launch.recordings.replay import Replay, replayed
     from cpcbl_launch.recordings.state_files import read_state, write_state
 
-    if speed is not None and not speed > 0.0:
-        raise InputError(f"--speed {speed:g}: more than 0 times real time")
     logging.getLogger("cpcbl_agents").setLevel(logging.ERROR)  # they said it in the run itself
     recorded = read_run(run)
     state = None if from_state is None else read_state(from_state)
-    whom = [f"{state.robot}/{state.incarnation}"] if state is not None and not robot else robot
-    processes = recorded.processes_of(whom or ())
+    if state is not None and not robot:
+        robot = [f"{state.robot}/{state.incarnation}"]
+    processes = recorded.processes_of(robot or ())
     if len(processes) != 1 and (dump or state):
         option = "--dump" if dump else "--from"
         raise InputError(f"{option}: of one process; choose it with --robot ROBOT/INCARNATION")
-    console, stop = Console(stderr=as_json), StopSignal()
-    with (
-        _page(recorded, view_listen, open_page, console) if view else nullcontext(ignore) as on_put
-    ):
+    console = Console(stderr=as_json)
+    page = _page(recorded, view_listen, open_page, console) if view else nullcontext(ignore)
+    with page as on_put:
         replays = [Replay(process, on_put, state, until) for process in processes]
-        if speed is not None or view:
-            play(replays, speed or 1.0, stop)
-        else:
-            for each in replays:
-                each.run(stop)
+        play(replays, speed or (1.0 if view else math.inf), StopSignal())
     if dump is not None:
         write_state(dump, replays[0].state)
     result = replayed(recorded, replays)

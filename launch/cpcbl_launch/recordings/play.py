@@ -10,7 +10,7 @@ LONGEST_SLEEP_S = 0.1
 
 def play(replays: Sequence[Replay], speed: float, stop: Callable[[], bool]) -> None:
     """Makes the steps of these replays at so many times the robots' time, until all are over or
-    `stop()`."""
+    `stop()`. An infinite speed is that of the machine."""
     begin_ns = min((r.upcoming.now_ns for r in replays if r.upcoming), default=0)
     begin_s = time.monotonic()
     while not stop():

@@ -64,8 +64,10 @@ function start(message) {
   $("team").textContent = team.name;
   document.title = `${team.name} · cpcbl-team view`;
   player.start(message.recording);
-  panel.clear();
-  if (!isSame) map.fit();
+  if (!isSame) {
+    panel.clear();
+    map.fit();
+  }
   if (team.chosen) say({ robot: team.chosen, camera: panel.isCameraOpen });
 }
 
