@@ -20,7 +20,7 @@ from cpcbl_launch.recordings.playback import OnPut, Playback, PlayedBus, PlayedS
 from cpcbl_launch.recordings.read import Process, Run
 from cpcbl_launch.recordings.state_files import NodeState
 from cpcbl_launch.team.faults import one_line
-from cpcbl_team.errors import InputError
+from cpcbl_team.errors import CpcblError, InputError
 
 
 class Replayed(msgspec.Struct, frozen=True, kw_only=True):
@@ -130,6 +130,8 @@ class Replay:
             self._make(step)
         except DifferenceError as error:
             self._end(error)
+        except CpcblError:  # such as a camera's robot without OpenCV
+            raise
         except Exception as error:  # whatever a node raises, or a recording that a person made
             where = traceback.extract_tb(error.__traceback__)[-1]
             self.exception = (
