@@ -175,8 +175,8 @@ WAYS = {
     ),
     "cpcbl-team up team.toml": LIVE._replace(says=ALIVE),
     "cpcbl-team up team.toml --duration 120 --record run.mcap": Way(SIMULATED, "trial", SHORT),
-    "cpcbl-team what-if RUN": Way("worth", "trial", "--duration 1", shows=LEDGER),
-    "cpcbl-team what-if RUN --without observer": Way("apart", more="--duration 1 --jobs 1"),
+    "cpcbl-team what-if run": Way("worth", "trial", "--duration 1", shows=LEDGER),
+    "cpcbl-team what-if run --without r3": Way("apart", more="--duration 1 --jobs 1"),
     "cpcbl-team what-if MRCLAM6 --duration 60 --hide 7": Way("apart", "trial", "--duration 2"),
     "cpcbl-team view run": LIVE._replace(says="view of team lab", more="--listen :0"),
     "cpcbl-team view team.toml": LIVE._replace(
