@@ -139,7 +139,7 @@ def _run(path: Path) -> None:
     record_run(path.with_name("run"), parse_team(TEAM), 1, 2.0, with_bus=True)
 
 
-READERS_OF_RUNS = "replay", "merge", "evaluate", "report", "view"
+READERS_OF_RUNS = "replay", "merge", "evaluate", "report", "view", "what-if"
 MAKERS: dict[str, Callable[[Path], object]] = {
     **dict.fromkeys(("MRCLAM2", "MRCLAM4", "MRCLAM6"), _log),
     "calibrated.toml": lambda path: path.write_text(builtin_path("mrclam").read_text()),
