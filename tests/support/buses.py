@@ -2,12 +2,15 @@
 
 import time
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from pathlib import Path
 from typing import Any
 
 import msgspec
 from hypothesis import settings
 
 from cpcbl_agents.node import Node, NodeStart
+from cpcbl_agents.process import tape_for
 from cpcbl_agents.robot import build_robot
 from cpcbl_team.config import (
     CollaborationSettings,
@@ -131,15 +134,28 @@ class TeamOnBus:
     """The nodes of a team on one hub, with a session of the test's own beside them."""
 
     def __init__(
-        self, team: Team, here: Sequence[str] | None = None, hub: MemoryHub | None = None
+        self,
+        team: Team,
+        here: Sequence[str] | None = None,
+        hub: MemoryHub | None = None,
+        record: Path | None = None,
     ) -> None:
+        """`record`: the folder that they record into, until `recorders` is closed."""
         self.team = team
+        self.recorders = ExitStack()
         self.hub = hub or MemoryHub()
         self.bus = self.hub.session()
         names = team.robots if here is None else here
         self.robots = {name: build_robot(name, team, 0) for name in names}
+        start = NodeStart(0, "1")
         self.nodes = {
-            name: Node(robot, team, self.hub.session(), NodeStart(0, "1"))
+            name: Node(
+                robot,
+                team,
+                self.hub.session(),
+                start,
+                tape=self.recorders.enter_context(tape_for(robot, team, start, record)),
+            )
             for name, robot in self.robots.items()
         }
         self.now_ns = 0

@@ -65,13 +65,15 @@ def header_of(robot: Robot, team: Team, start: NodeStart, is_guest: bool = False
 
 
 def program_version() -> str:
-    """The version of this program, and a digest of all sources that a robot's node consists of."""
+    """The version of this program, a digest of all sources that a robot's node consists of, and
+    whether the core is compiled."""
     digest = blake2b(digest_size=4)
     for package in PACKAGES:
         top = Path(*package.__path__)
         for path in sorted(top.rglob("*.py")):
             digest.update(str(path.relative_to(top)).encode() + path.read_bytes())
-    return f"{metadata.version('cpcbl-team')} {digest.hexdigest()}"
+    compiled = " compiled" if is_compiled() else ""
+    return f"{metadata.version('cpcbl-team')} {digest.hexdigest()}{compiled}"
 
 
 def is_compiled() -> bool:

@@ -65,7 +65,7 @@ class StateError(Exception):
 
 
 def encode_state(root: object) -> bytes:
-    """The object and all that it refers to."""
+    """The object and all that it refers to. Raises StateError where the core is compiled."""
     return msgspec.msgpack.encode(_Encoder().table(root))
 
 
@@ -134,8 +134,9 @@ class _Encoder:
         elif kind.__module__ == "numpy":
             yield from ("array", value.dtype.str, list(value.shape), value.tobytes())
         else:
-            attributes = _attributes(value)
-            names = ((name, self._value(inner)) for name, inner in attributes.items())
+            if hasattr(kind, "__mypyc_attrs__"):
+                raise StateError("the core is compiled: its objects cannot be made again")
+            names = ((name, self._value(inner)) for name, inner in vars(value).items())
             yield from ("object", _name(kind), *(part for pair in names for part in pair))
 
 
@@ -153,14 +154,6 @@ def _is_allowed(module: str) -> bool:
 
 def _is_mapping(kind: type[Any]) -> bool:
     return kind in (dict, Counter, types.MappingProxyType)
-
-
-def _attributes(value: Any) -> dict[str, Any]:
-    """The attributes of an object; those of a compiled class are no dictionary."""
-    names = getattr(type(value), "__mypyc_attrs__", None)
-    if names is None:
-        return dict(vars(value))
-    return {name: getattr(value, name) for name in names if hasattr(value, name)}
 
 
 def _name(definition: Any) -> str:

@@ -116,7 +116,8 @@ def _page(run: "Run", listen: str | None, open_page: bool, console: Console) -> 
 
     hub = MemoryHub()
     bus = hub.session()
-    team = next(process.team for process in run.processes_of(()) if not process.header.is_guest)
+    processes = sorted(run.processes_of(()), key=lambda process: process.header.is_guest)
+    team = processes[0].team  # a guest's has itself beside the team's robots
     feed, where = Feed(team.robots), parse_listen("--view-listen", listen)
     with serve(ShownTeam(team.name, str(run.folder), team), feed, where) as address:
         for line in address_lines(team.name, address, where):

@@ -20,6 +20,7 @@ from cpcbl_launch.recordings.playback import OnPut, Playback, PlayedBus, PlayedS
 from cpcbl_launch.recordings.read import Process, Run
 from cpcbl_launch.recordings.state_files import NodeState
 from cpcbl_launch.team.faults import one_line
+from cpcbl_team.errors import CpcblError, InputError
 
 
 class Replayed(msgspec.Struct, frozen=True, kw_only=True):
@@ -86,6 +87,10 @@ class Replay:
             self.node = self._restored(state.state, state.version, state.where)
         elif header.first_step:
             where = str(process.segments[0].path)
+            if not header.state:
+                raise LogError(
+                    f"{where}: has no state to begin with, and files before it are missing"
+                )
             self.node = self._restored(header.state, header.version, where)
         self.begun_at = self.number + 1
         self._until_ns = header.start_ns + until_s * 1e9
@@ -125,6 +130,8 @@ class Replay:
             self._make(step)
         except DifferenceError as error:
             self._end(error)
+        except CpcblError:  # such as a camera's robot without OpenCV
+            raise
         except Exception as error:  # whatever a node raises, or a recording that a person made
             where = traceback.extract_tb(error.__traceback__)[-1]
             self.exception = (
@@ -157,15 +164,19 @@ class Replay:
 
     @property
     def state(self) -> NodeState:
-        """The state after the latest step."""
+        """The state after the latest step. Raises InputError where the core is compiled."""
         header = self._process.header
+        try:
+            state = self.playback.state(self.node)
+        except StateError as error:
+            raise InputError(f"--dump: {error}; do it with the core as it comes") from error
         return NodeState(
             version=program_version(),
             robot=header.robot,
             incarnation=header.incarnation,
             step=self.number,
             now_ns=self.now_ns,
-            state=self.playback.state(self.node),
+            state=state,
         )
 
     @property
