@@ -31,7 +31,7 @@ FEW = {
     "log": 120,
     "recording": 200,
     "picture": 300,
-    "merged": 30,
+    "merged": 20,
     "run": 6,
 }
 MANY = 10_000  # of each kind

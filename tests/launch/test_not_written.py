@@ -78,11 +78,14 @@ def test_a_full_standard_output_is_one_line() -> None:
     assert "Traceback" not in ran.stderr
 
 
-@pytest.mark.parametrize("option", ["--record", "--report", "--picture"])
+@pytest.mark.parametrize(
+    ("option", "name"),
+    [("--record", "run.mcap"), ("--report", "run.json"), ("--picture", "run.png")],
+)
 def test_a_file_that_cannot_be_made_is_refused_before_anything_starts(
-    option: str, tmp_path: Path
+    option: str, name: str, tmp_path: Path
 ) -> None:
-    ran = command_line("up", "--duration", 2, option, tmp_path / "nowhere" / "run.png")
+    ran = command_line("up", "--duration", 2, option, tmp_path / "nowhere" / name)
     assert ran.returncode == 2
     assert ran.stderr.splitlines()[-1].startswith(f"cpcbl-team: {option} ")
     assert "watch it" not in ran.stdout

@@ -256,9 +256,8 @@ def simulate(
         run = Run(team, duration, seed=seed, picture=picture, record=record)
         result = simulate_run(run, progress)
     lost = options.write_report(report, result) | result.not_written
-    console = Console(stderr=as_json)
-    lost |= options.merge_recording(run.record_folder, console)
-    options.print_result(result, as_json, lambda: print_report(result, console), lost)
+    recorded = run.record_folder
+    options.print_result(result, as_json, lambda: print_report(result, Console()), lost, recorded)
 
 
 def chaos(

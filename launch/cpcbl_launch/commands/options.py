@@ -2,13 +2,13 @@
 
 import math
 import os
+import signal
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from rich.console import Console
 from typer import Argument, CallbackParam, Context, Exit, Option, secho
 
 from cpcbl_launch.reporting.files import json_text, write_or_reason
@@ -19,6 +19,8 @@ from cpcbl_team.errors import InputError
 
 if TYPE_CHECKING:
     from cpcbl_launch.lab.seeds import Workers
+
+LARGE_RUN = 20_000_000  # bytes, of which one file is not made in a moment
 
 
 def require_folder(option: str, folder: Path) -> None:
@@ -191,13 +193,21 @@ def write_report(path: Path | None, result: object) -> dict[str, str]:
 
 
 def print_result(
-    result: object, as_json: bool, show: Callable[[], None], lost: Mapping[str, str] = {}
+    result: object,
+    as_json: bool,
+    show: Callable[[], None],
+    lost: Mapping[str, str] = {},
+    recorded: Path | None = None,
 ) -> None:
-    """Prints a result as JSON on standard output, or shows it to a person; then what was lost."""
+    """Prints a result as JSON on standard output, or shows it to a person; then what was lost.
+    `recorded`: the folder of a run of which one file is to be made last."""
     if as_json:
         sys.stdout.write(json_text(result) + "\n")
     else:
         show()
+    if recorded is not None:
+        sys.stdout.flush()
+        lost = {**lost, **_merge_recording(recorded)}
     print_not_written(lost)
 
 
@@ -209,21 +219,26 @@ def print_not_written(lost: Mapping[str, str]) -> None:
         raise Exit(1)
 
 
-def merge_recording(folder: Path | None, console: Console) -> dict[str, str]:
-    """Makes one file of a run that was recorded into a folder. Returns the file and the reason
-    where that failed: the robots' own files are there all the same."""
-    if folder is None:
-        return {}
+def _merge_recording(folder: Path) -> dict[str, str]:
+    """Makes one file of a recorded run; of a long one that takes minutes, so a signal ends it.
+    Returns the file and the reason where that failed: the robots' own files are there all the
+    same."""
     from cpcbl_launch.recordings.gather import MERGED
     from cpcbl_launch.recordings.merge import merge, merged_line
 
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        if signal.getsignal(number) != signal.SIG_IGN:
+            signal.signal(number, signal.default_int_handler)
+    if sum(path.stat().st_size for path in folder.rglob("*") if path.is_file()) > LARGE_RUN:
+        words = f"making {folder / MERGED}; Ctrl-C leaves that to `cpcbl-team merge {folder}`"
+        secho(words, err=True, dim=True)
     try:
         merged = merge(folder)
     except InputError as error:
         return {str(folder / MERGED): str(error)}
     except OSError as error:
         return {str(folder / MERGED): error.strerror or str(error)}
-    console.print(merged_line(merged), style="dim", highlight=False, soft_wrap=True)
+    secho(merged_line(merged), err=True, dim=True)
     return {}
 
 

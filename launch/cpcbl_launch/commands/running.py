@@ -107,8 +107,8 @@ def up(
     with page as attach, LiveTable(title, run.team.robots, console, quiet=as_json) as table:
         result = run_team(run, table.show, StopSignal(), launch, attach)
     lost = dict(result.not_written) | options.write_report(report, result)
-    lost |= options.merge_recording(run.record_folder, console)
-    options.print_result(result, as_json, lambda: print_report(result, console), lost)
+    recorded = run.record_folder
+    options.print_result(result, as_json, lambda: print_report(result, console), lost, recorded)
     if not result.has_data and not StopSignal.was_interrupted:
         _fail_without_data(run)
 

@@ -22,7 +22,7 @@ from cpcbl_launch.views.web.server import ShownTeam, serve
 from cpcbl_transport.memory_bus import MemoryHub
 
 DEMO = load_team(builtin_path("demo"))
-SECONDS = 16.0
+SECONDS = 12.5
 PATIENCE_S = 30.0
 
 
@@ -87,15 +87,15 @@ def test_it_plays_jumps_and_pauses(recording: RecordedFile) -> None:
             assert viewer.team["recording"]["duration_s"] == pytest.approx(SECONDS, abs=0.2)
             early = viewer.robots["patrol"]["pose"]
 
-            await viewer.say(at_s=14.0, play=False)
-            frame = await viewer.until(14.0, 14.0)
+            await viewer.say(at_s=12.2, play=False)
+            frame = await viewer.until(12.2, 12.2)
             assert frame["play"] == [1.0, False]
             assert viewer.robots["patrol"]["pose"] != early
             assert {robot["state"] for robot in viewer.robots.values()} == {"ok"}
             assert viewer.robots["scout"]["error_m"] < 0.3
             assert any(arrow[:3] == ["observer", "scout", "fix"] for arrow in viewer.help)
             assert len(viewer.team["history"]["scout"]) > 20  # of the time before
-            assert (await viewer.next())["at_s"] == 14.0  # nobody is gone while it pauses
+            assert (await viewer.next())["at_s"] == 12.2  # nobody is gone while it pauses
             assert not (await viewer.next())["robots"]
 
             await viewer.say(at_s=3.0)
@@ -110,7 +110,7 @@ def test_at_its_end_it_stops_and_begins_again(recording: RecordedFile) -> None:
     async def test() -> None:
         async with viewed(recording) as viewer:
             await viewer.until(0.1, 20.0)
-            await viewer.say(at_s=13.0, speed=100.0, play=True)
+            await viewer.say(at_s=9.0, speed=100.0, play=True)
             while (frame := await viewer.next())["play"][1]:
                 pass
             assert frame["at_s"] == pytest.approx(SECONDS, abs=0.2)
