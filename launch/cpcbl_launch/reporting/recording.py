@@ -21,6 +21,7 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 from zstandard import ZstdError
 
+from cpcbl_agents.flight_recorder import without_passwords
 from cpcbl_agents.sources.mrclam import LogError
 from cpcbl_launch.reporting.metrics import Floats
 from cpcbl_launch.reporting.recorder import truth_rows
@@ -68,7 +69,8 @@ class Recording(AbstractContextManager["Recording"]):
         self._file = path.open("wb")
         self._writer: Writer | None = Writer(self._file, CHUNK_BYTES)
         self._writer.start(profile="cpcbl", library="cpcbl-team")
-        self._writer.add_attachment(0, 0, TEAM, "application/json", msgspec.json.encode(team))
+        attached = msgspec.json.encode(without_passwords(team))
+        self._writer.add_attachment(0, 0, TEAM, "application/json", attached)
         self._channels: dict[str, int] = {}
         self._schema = 0
         self._handles = [bus.subscribe(topic.at(), self._receive) for topic in RECORDED]
