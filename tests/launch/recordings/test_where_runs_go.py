@@ -10,7 +10,8 @@ from support.processes import command_line
 from cpcbl_agents.flight_recorder import header_of
 from cpcbl_agents.node import NodeStart
 from cpcbl_agents.robot import build_robot
-from cpcbl_launch.reporting.recording import Recording, read_recording
+from cpcbl_launch.reporting.recorded_file import read_recording
+from cpcbl_launch.reporting.recording import Recording
 from cpcbl_launch.run.containers.compose import Deployment, Mount, compose_text
 from cpcbl_launch.run.processes import tasks
 from cpcbl_launch.run.up import Run
