@@ -52,7 +52,7 @@ def header_of(robot: Robot, team: Team, start: NodeStart, is_guest: bool = False
         python=platform.python_version(),
         platform=f"{platform.system()} {platform.machine()}",
         is_compiled=is_compiled(),
-        team=msgspec.json.encode(_without_passwords(team)),
+        team=msgspec.json.encode(without_passwords(team)),
         is_guest=is_guest,
         start_ns=start.stamp_ns,
         speed=start.speed,
@@ -81,7 +81,7 @@ def is_compiled() -> bool:
     return not landmarks.__file__.endswith(".py")
 
 
-def _without_passwords(team: Team) -> Team:
+def without_passwords(team: Team) -> Team:
     """The team without the passwords of cameras, which are in their addresses."""
     robots = dict(team.robots)
     for name, robot in robots.items():

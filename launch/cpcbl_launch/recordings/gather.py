@@ -5,7 +5,7 @@ in the sender's and in the receiver's. It is taken once, from the file that come
 """
 
 import heapq
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -49,32 +49,34 @@ def is_recording(path: Path) -> bool:
     return any(path.glob("*.mcap")) or any(path.glob(f"*/*{SUFFIX}"))
 
 
-def gather(run: Path) -> Gathered:
-    """The folder of a run, or a recording. Raises LogError, TeamFileError."""
+def gather(run: Path, is_wanted: Callable[[str], bool] = lambda key: True) -> Gathered:
+    """The folder of a run, or a recording; messages under the keys that are wanted. Raises
+    LogError, TeamFileError."""
     if not run.is_dir():
-        return _of_file(run)
+        return _of_file(run, is_wanted)
     bus = run / BUS
     if not any(run.glob(f"*/*{SUFFIX}")):
         for path in (bus, run / MERGED):
             if path.is_file():
-                return _of_file(path)
+                return _of_file(path, is_wanted)
     found = read_run(run)
     remarks = list(found.damage)
     processes = [process for of_robot in found.processes.values() for process in of_robot]
     sources: list[Iterator[Recorded]] = []
     if bus.is_file():
-        heard = _of_file(bus)
+        heard = _of_file(bus, is_wanted)
         remarks += heard.remarks
         sources.append(heard.messages)
     sources += [_of_process(process, remarks, has_looks=bus.is_file()) for process in processes]
     first = processes[0]
-    return Gathered(first.team, first.header.version, _merged(sources), remarks)
+    wanted = (recorded for recorded in _merged(sources) if is_wanted(recorded.key))
+    return Gathered(first.team, first.header.version, wanted, remarks)
 
 
-def _of_file(path: Path) -> Gathered:
+def _of_file(path: Path, is_wanted: Callable[[str], bool]) -> Gathered:
     recording = RecordedFile(path)
     remarks = [] if recording.is_whole else [f"{path}: its last seconds are missing"]
-    return Gathered(recording.team, recording.version, recording.messages(), remarks)
+    return Gathered(recording.team, recording.version, recording.messages(is_wanted), remarks)
 
 
 def _merged(sources: Sequence[Iterator[Recorded]]) -> Iterator[Recorded]:

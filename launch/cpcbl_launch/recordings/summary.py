@@ -14,6 +14,7 @@ from cpcbl_launch.reporting.metrics import Floats
 from cpcbl_launch.reporting.phases import guest_reports
 from cpcbl_launch.reporting.recorder import Recorder, Report, variants_of
 from cpcbl_team.config import Team
+from cpcbl_transport import topics
 from cpcbl_transport.messages import Status, Track, Truths
 
 MOST_EVENTS = 2000
@@ -48,7 +49,7 @@ class RunSummary(NamedTuple):
 
 def summarize(path: Path) -> RunSummary:
     """The figures of a recorded run. Raises LogError, TeamFileError."""
-    found = gather(path)
+    found = gather(path, _is_figured)
     recorder, log, events = Recorder(), EventLog(), list[Event]()
     spans: dict[str, list[int]] = {}  # by robot, the first and the last stamp
     for at_ns, key, message in found.messages:
@@ -82,6 +83,10 @@ def summarize(path: Path) -> RunSummary:
         events=tuple(events),
         remarks=tuple(remarks),
     )
+
+
+def _is_figured(key: str) -> bool:
+    return key.startswith(("track/", "status/", topics.TRUTH.key))
 
 
 def _span_s(spans: Mapping[str, list[int]]) -> tuple[float, float]:

@@ -14,7 +14,7 @@ from typing import BinaryIO, NamedTuple
 
 import msgspec
 from mcap.exceptions import EndOfFile
-from mcap.reader import make_reader
+from mcap.reader import McapReader, make_reader
 from mcap.records import Attachment, Channel, DataEnd, Metadata, Schema
 from mcap.records import Message as Record
 from mcap.stream_reader import StreamReader
@@ -108,8 +108,9 @@ class RecordedFile:
         order of their times. Raises LogError."""
         with _readable(self.path), self.path.open("rb") as file:
             if self.is_whole:
-                rows: Iterator[_Row] = make_reader(file).iter_messages(
-                    starting_at=from_ns, ending_before=until_ns
+                reader = make_reader(file)
+                rows: Iterator[_Row] = reader.iter_messages(
+                    _wanted_topics(reader, is_wanted), starting_at=from_ns, ending_before=until_ns
                 )
             else:
                 rows = _rows_of_cut(file, from_ns or 0, until_ns or LAST_NS)
@@ -125,6 +126,16 @@ def _readable(path: Path) -> Iterator[None]:
     except DAMAGE as error:
         what = one_line(f"{type(error).__name__} {error}")
         raise LogError(f"{path}: not a whole recording: {what}") from error
+
+
+def _wanted_topics(reader: McapReader, is_wanted: Callable[[str], bool]) -> list[str] | None:
+    """With the topics of pictures, which messages under other keys get; None where no index says
+    which topics there are."""
+    summary = reader.get_summary()
+    if summary is None or not summary.channels:
+        return None
+    topics_there = {channel.topic for channel in summary.channels.values()}
+    return [t for t in topics_there if is_wanted(t) or t.startswith((PICTURES, CAMERAS))]
 
 
 def _is_ended(file: BinaryIO) -> bool:

@@ -19,6 +19,7 @@ from mcap.exceptions import McapError
 from mcap.writer import Writer
 from zstandard import ZstdError
 
+from cpcbl_agents.flight_recorder import without_passwords
 from cpcbl_team.config import Team
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus
@@ -51,7 +52,8 @@ class Recording(AbstractContextManager["Recording"]):
         self._file = path.open("wb")
         self._writer: Writer | None = Writer(self._file, CHUNK_BYTES)
         self._writer.start(profile="cpcbl", library="cpcbl-team")
-        self._writer.add_attachment(0, 0, TEAM, "application/json", msgspec.json.encode(team))
+        attached = msgspec.json.encode(without_passwords(team))
+        self._writer.add_attachment(0, 0, TEAM, "application/json", attached)
         self._channels: dict[str, int] = {}
         self._schema = 0
         self._handles = [bus.subscribe(topic.at(), self._receive) for topic in RECORDED]

@@ -4,13 +4,20 @@ from pathlib import Path
 
 import pytest
 import yaml
+from msgspec.structs import replace
 from support.processes import command_line
 
+from cpcbl_agents.flight_recorder import header_of
+from cpcbl_agents.node import NodeStart
+from cpcbl_agents.robot import build_robot
+from cpcbl_launch.reporting.recorded_file import read_recording
+from cpcbl_launch.reporting.recording import Recording
 from cpcbl_launch.run.containers.compose import Deployment, Mount, compose_text
 from cpcbl_launch.run.processes import tasks
 from cpcbl_launch.run.up import Run
-from cpcbl_launch.team.file import builtin_path, load_team, parse_team
+from cpcbl_launch.team.file import builtin_path, decode_resolved, load_team, parse_team
 from cpcbl_team.errors import InputError
+from cpcbl_transport.memory_bus import MemoryHub
 
 DEMO = load_team(builtin_path("demo"))
 TEAM = 'name = "lab"\n[robots.r1]\nsource = "external"\n'
@@ -82,3 +89,16 @@ def test_replay_says_in_one_line_what_it_cannot_use(tmp_path: Path) -> None:
         assert ended.returncode == 2
         assert ended.stderr.startswith("cpcbl-team: ")
         assert ended.stderr.count("\n") == 1
+
+
+def test_no_recording_has_the_password_of_a_camera(tmp_path: Path) -> None:
+    team, url = load_team(builtin_path("eyes")), "rtsp://me:secret@10.0.0.7/stream"
+    camera = replace(team.robots["rover1"].camera, frames=url)
+    rover = replace(team.robots["rover1"], source="external", camera=camera)
+    team = replace(team, robots={**team.robots, "rover1": rover})
+    header = header_of(build_robot("rover1", team, 0), team, NodeStart(0, "1"))
+    with Recording(tmp_path / "run.mcap", team, MemoryHub().session()):
+        pass
+    recorded = read_recording(tmp_path / "run.mcap").team
+    for found in (recorded, decode_resolved(header.team, "team")):
+        assert found.robots["rover1"].camera.frames == "rtsp://10.0.0.7/stream"

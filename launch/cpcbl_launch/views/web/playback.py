@@ -21,6 +21,8 @@ from cpcbl_transport.messages import AnnotatedFrame, Status, Track, Truths, enco
 
 CYCLE_S = 0.05
 BEFORE_NS = 60_000_000_000  # what plots show
+RECENT_NS = 6_000_000_000  # of which rates are known
+STEP_NS = 450_000_000  # between two points of a plot
 SLOWEST, FASTEST = 0.1, 100.0
 SHOWN = (Track, Status, Truths, Sightings, AnnotatedFrame)
 
@@ -109,8 +111,7 @@ class Playback:
             if jump_to_ns is not None:
                 self.feed.clear()
                 self._problem = ""
-                from_ns = max(self.begin_ns, jump_to_ns - BEFORE_NS)
-                messages, waiting = self._messages(from_ns), None
+                messages, waiting = self._messages(jump_to_ns), None
                 at_ns = jump_to_ns
             else:
                 elapsed_ns = round((now_s - before_s) * 1e9 * self._speed)
@@ -146,11 +147,13 @@ class Playback:
                 if self._jump_to_ns == jumped_to_ns:  # nobody wants to be elsewhere meanwhile
                     self._jump_to_ns = None
 
-    def _messages(self, from_ns: int) -> Iterator[Recorded]:
-        def is_shown(key: str) -> bool:
-            return not key.startswith("in/") or key.endswith("/sightings")
-
-        return self._recording.messages(is_shown, from_ns, self._end_ns + 1)
+    def _messages(self, to_ns: int) -> Iterator[Recorded]:
+        """From the minute before a time on: at first what trails and plots need, then all."""
+        recent_ns = max(self.begin_ns, to_ns - RECENT_NS)
+        if recent_ns > self.begin_ns:
+            from_ns = max(self.begin_ns, to_ns - BEFORE_NS)
+            yield from _thin(self._recording.messages(_is_in_plots, from_ns, recent_ns))
+        yield from self._recording.messages(_is_shown, recent_ns, self._end_ns + 1)
 
     def _publish(self, recorded: Recorded) -> None:
         key, message = recorded.key, recorded.message
@@ -159,3 +162,22 @@ class Playback:
         if key not in self._publishers:
             self._publishers[key] = self._bus.publisher(key, topics.Qos.TELEMETRY)
         self._publishers[key].put(encode(message))
+
+
+def _is_shown(key: str) -> bool:
+    return key.endswith("/sightings") or _is_in_plots(key) or key.startswith(("status/", "look/"))
+
+
+def _is_in_plots(key: str) -> bool:
+    return key.startswith(("track/", topics.TRUTH.key))
+
+
+def _thin(messages: Iterator[Recorded]) -> Iterator[Recorded]:
+    """Without most poses, of which a plot shows a few a second."""
+    latest_ns: dict[str, int] = {}
+    for recorded in messages:
+        if isinstance(recorded.message, Track):
+            if recorded.at_ns - latest_ns.get(recorded.key, -STEP_NS) < STEP_NS:
+                continue
+            latest_ns[recorded.key] = recorded.at_ns
+        yield recorded
