@@ -9,6 +9,7 @@ import heapq
 from collections.abc import Callable
 from itertools import count
 from random import Random
+from typing import TypeVar
 
 from cpcbl_launch.lab.luck.history import Event, Kind
 from cpcbl_transport.bus import (
@@ -29,6 +30,7 @@ MOST_LATE_COPY_S = 4.0
 HELP, INPUTS = ("fix/", "belief/"), "in/"
 CUTS: tuple[Kind, ...] = ("cut", "mute", "deaf")
 OnPut = Callable[[str, str, bytes], None]  # called with the session, the key and the payload
+Thing = TypeVar("Thing")
 OnDelivery = Callable[[str, bytes], None]
 
 
@@ -155,7 +157,7 @@ class Network:
 
     def watch(self, watch: "_Watch") -> Handle:
         self._watches.append(watch)
-        return _Taken(lambda: watch in self._watches and self._watches.remove(watch))
+        return _Taken(lambda: _remove(self._watches, watch))
 
     def _synchronize(self) -> None:
         for watch in list(self._watches):
@@ -173,6 +175,11 @@ def _cut_links(event: Event) -> list[tuple[str, str]]:
     out, back = (event.robot, ""), ("", event.robot)
     links = {"cut": [out, back], "mute": [out], "hidden-tokens": [out], "deaf": [back]}
     return links.get(event.kind, [])
+
+
+def _remove(things: list[Thing], thing: Thing) -> None:
+    if thing in things:
+        things.remove(thing)
 
 
 class _Taken(Handle):
@@ -198,7 +205,9 @@ class _Watch:
         """Reports the tokens that have appeared, then those that have disappeared."""
         network, seen = self._network, self._seen
         here = {key: network.owners[key] for key in network.hub.tokens.find([self._keys])}
-        sees = {owner: network.sees(self._viewer, owner) for owner in {*here.values(), *seen.values()}}
+        sees = {
+            owner: network.sees(self._viewer, owner) for owner in {*here.values(), *seen.values()}
+        }
         new = [key for key, owner in here.items() if key not in seen and sees[owner]]
         gone = [
             key
@@ -248,7 +257,7 @@ class _Session(BusProxy):
         """Lists a declaration until the handle is closed."""
         keys = self.network.declared[self.name][what]
         keys.append(key)
-        return _Taken(lambda: key in keys and keys.remove(key))
+        return _Taken(lambda: _remove(keys, key))
 
     def reaches_any(self, key: str) -> bool:
         """Whether a subscriber is on this side of the cuts."""

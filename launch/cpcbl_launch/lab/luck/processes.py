@@ -53,7 +53,7 @@ class ClockedField(SimulatedField):
         return 0 if clock is None else clock.ahead_ns(self.now_ns)
 
     def advance(self, pictures: bool = True) -> list[tuple[str, SensorInput]]:
-        """One step. A piece of odometry begins where the one before ended, by the driver's clock."""
+        """One step. A piece of odometry begins where the one before ended, by the same clock."""
         sensed = []
         for name, item in super().advance(pictures):
             if isinstance(item, Odometry) and name in self._before_ns:
@@ -144,8 +144,10 @@ class RobotProcess:
     @property
     def is_due(self) -> bool:
         now_ns = self._network.now_ns
-        return not self.is_paused and self.node is not None and (
-            self.node.waiting or self.node.next_ns <= now_ns + self.ahead_ns(now_ns)
+        return (
+            not self.is_paused
+            and self.node is not None
+            and (self.node.waiting or self.node.next_ns <= now_ns + self.ahead_ns(now_ns))
         )
 
     def step(self) -> None:

@@ -27,6 +27,7 @@ from cpcbl_launch.lab.luck.processes import (
 )
 from cpcbl_launch.lab.luck.spending import SpendingMonitor
 from cpcbl_launch.lab.luck.teams import guest_settings, team_of, with_world_events
+from cpcbl_launch.lab.luck.violations import Violation
 from cpcbl_launch.simulation.field_node import FieldNode
 from cpcbl_team.config import Team
 from cpcbl_transport import topics
@@ -34,18 +35,6 @@ from cpcbl_transport.bus import Bus
 from cpcbl_transport.messages import Track, decode_tagged
 
 TRUTH_NS = 100_000_000
-
-
-class Violation(msgspec.Struct, frozen=True):
-    """An invariant that did not hold: when, of which robot, and what was wrong."""
-
-    invariant: str
-    robot: str
-    at_s: float
-    what: str
-
-    def __str__(self) -> str:
-        return f"{self.invariant}: at {self.at_s:.2f} s, {self.robot or 'the team'}: {self.what}"
 
 
 class Run(NamedTuple):
@@ -97,7 +86,9 @@ class Simulation:
                     robot.witness.check_order(robot.node.robot.filter.timeline)
         except Exception as bug:
             where = traceback.extract_tb(bug.__traceback__)[-1]
-            what = f"{type(bug).__name__}: {bug} ({where.filename.rpartition('/')[2]}:{where.lineno})"
+            what = (
+                f"{type(bug).__name__}: {bug} ({where.filename.rpartition('/')[2]}:{where.lineno})"
+            )
             self._report("no exception", "", what)
         states = [r.node.robot.filter.timeline.state for r in self.robots.values() if r.node]
         self._digest.update("".join(map(_canonical, states)).encode())
@@ -106,7 +97,9 @@ class Simulation:
 
     def _step(self, end_ns: int) -> None:
         """Goes to the next time at which something is due, and does all of it."""
-        network, steppables = self.network, (*self.robots.values(), *self._guests.values())
+        network = self.network
+        steppables: list[RobotProcess | GuestProcess]
+        steppables = [*self.robots.values(), *self._guests.values()]
         due_ns = min(self._field_node.next_ns, *(s.next_ns for s in steppables))
         queued_ns = network.next_ns
         due_ns = due_ns if queued_ns is None else min(due_ns, queued_ns)
@@ -115,7 +108,7 @@ class Simulation:
             self._field_node.step(network.now_ns)
             for name, robot in self._field.robots.items():
                 self._truth[name].append((network.now_ns * 1e-9, *robot.pose))
-        steppables = (*self.robots.values(), *self._guests.values())
+        steppables = [*self.robots.values(), *self._guests.values()]
         while due := [s for s in steppables if s.is_due]:
             for steppable in due:
                 steppable.step()
@@ -127,7 +120,7 @@ class Simulation:
         self.network.at(int(event.from_s * 1e9), begin)
         self.network.at(int(event.until_s * 1e9), end)
 
-    def _actions(self, event: Event) -> tuple[Callable[[], object], Callable[[], object]]:
+    def _actions(self, event: Event) -> tuple[Callable[[], None], Callable[[], None]]:
         """What happens when an event begins, and when it ends."""
         network, robot = self.network, self.robots.get(event.robot)
         match event.kind:

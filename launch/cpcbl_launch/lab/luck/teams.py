@@ -1,4 +1,4 @@
-"""The teams of the simulator: small, of mixed quality, on a field of their own. A seed makes one."""
+"""The teams of the simulator: small, of mixed quality, on a field of their own."""
 
 import math
 from random import Random
@@ -20,6 +20,7 @@ from cpcbl_team.config import (
     Start,
     Team,
 )
+from cpcbl_team.config.localizer import Variant
 
 WIDTH_M, HEIGHT_M = 9.0, 6.0
 OBSERVER, GUESTS = "observer", ("visitor1", "visitor2")
@@ -30,6 +31,7 @@ BUDGETS = (
     BudgetSettings(bytes_per_s=300.0),
     BudgetSettings(messages_per_minute=60.0),
 )
+VARIANTS: tuple[Variant, ...] = ("joint", "joint", "joint", "oval", "circular")
 ODOMETRY_HZ, STEP_HZ = 10.0, 10.0
 
 
@@ -45,7 +47,7 @@ def team_of(seed: int) -> Team:
         is_blind = dice.random() < 0.4
         robots[f"{'blind' if is_blind else 'guide'}{number}"] = _driver(dice, rules, is_blind)
     marks = {f"m{n}": _landmark(dice, n) for n in range(dice.randint(4, 8))}
-    variant = dice.choice(("joint", "joint", "joint", "oval", "circular"))
+    variant = dice.choice(VARIANTS)
     localizer = LocalizerSettings(variant=variant)
     return Team(
         name="luck",

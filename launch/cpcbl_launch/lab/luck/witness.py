@@ -1,26 +1,24 @@
 """What one process of a robot does, held against rules that have no exception.
 
-The witness sees each message that the bus delivers, each that the robot handles, and each input that
-its timeline takes; it compares them with what the robot itself counts. What it needs to know of
-tiers and subscriptions it takes from the bus, not from the robot.
+The witness sees each message that the bus delivers, each that the robot handles, and each input
+that its timeline takes; it compares them with what the robot itself counts. What it needs to know
+of tiers and subscriptions it takes from the bus, not from the robot.
 """
 
 from collections.abc import Callable
 from itertools import pairwise
-from typing import NamedTuple
 
 import msgspec
 
+from cpcbl_agents.agent import BusEvent, Tick
 from cpcbl_agents.filtering import FilterAgent
-from cpcbl_agents.guests import MAX_REMEMBERED
 from cpcbl_agents.inbox import INBOX
 from cpcbl_agents.node import Node
 from cpcbl_agents.robot import Robot
 from cpcbl_launch.lab.luck.network import HELP, Network
 from cpcbl_team.config import Team
-from cpcbl_team.fixes import FIX
 from cpcbl_team.inputs import Belief, Fix, HeadingBelief, Input, Odometry
-from cpcbl_team.state import State
+from cpcbl_team.state import FIX, State
 from cpcbl_team.teammates import MOST_SENDERS
 from cpcbl_team.timeline import HORIZON_NS, Timeline, TimelineRefusal
 from cpcbl_transport import topics
@@ -32,13 +30,6 @@ LATEST_NS = HORIZON_NS + 600_000_000  # a belief counts from half a second befor
 ORDER_EVERY_S = 7  # statuses: the order of inputs is checked once in so many
 OWN_KEYS = 24  # publishers of a robot beside its fixes
 Report = Callable[[str, str, str], None]  # called with an invariant, the robot and what was wrong
-
-
-class Invariant(NamedTuple):
-    """Something that holds of every history."""
-
-    name: str
-    text: str
 
 
 class Witness:
@@ -78,7 +69,9 @@ class Witness:
         """The timeline took an input or did not; `counted`: how many refusals were counted."""
         if counted != (not is_used):
             word = "used" if is_used else "refused"
-            self._fail("counted", f"{_text(item)} was {word} and counted {counted} times as refused")
+            self._fail(
+                "counted", f"{_text(item)} was {word} and counted {counted} times as refused"
+            )
         if not is_used:
             return
         self.used += 1
@@ -160,7 +153,6 @@ class Witness:
             "records of senders": (len(state.memory.teammates.senders), MOST_SENDERS + 1),
             "senders of beliefs": (len(state.memory.teammates.beliefs), MOST_SENDERS),
             "watched robots": (len(node.robot.collaboration.guests.watched_robots), self._most),
-            "remembered names": (MAX_REMEMBERED, MAX_REMEMBERED),
         }
         for what, (number, bound) in sizes.items():
             if number > bound:
@@ -222,7 +214,7 @@ class _WatchedRobot(Robot):
         vars(self).update(vars(robot))
         self.filter, self._witness = _WatchedFilter(robot.filter, witness), witness
 
-    def handle(self, message, now_ns):  # type: ignore[no-untyped-def]
+    def handle(self, message: Message | Tick | BusEvent, now_ns: int) -> list[Outgoing]:
         if isinstance(message, Message):
             self._witness.note_handled(message)
         return super().handle(message, now_ns)
