@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 from cpcbl_agents import collaboration, declarations, filtering, node, process
+from cpcbl_launch.lab.luck import simulator
 from cpcbl_team import teammates, timeline
 from cpcbl_transport import budget
 
@@ -33,9 +34,7 @@ BUGS = {
     "double count": Bug(
         timeline.Timeline, "add", "keys[index] == key:", "keys[index] == key and not keys:"
     ),
-    "late data": Bug(
-        timeline.Timeline, "add", "key[0] < keys[-1][0] - self._horizon_ns", "False"
-    ),
+    "late data": Bug(timeline.Timeline, "add", "key[0] < keys[-1][0] - self._horizon_ns", "False"),
     "budget leak": Bug(
         process, "make_robot", "late or before.moved or before.ran, camera", "False, camera"
     ),
@@ -47,9 +46,7 @@ BUGS = {
     ),
     "subscriptions kept": Bug(declarations, "_declare", "declared.pop(key).close()", "pass"),
     "refusal not counted": Bug(node.Node, "_handle_payload", "self.counts[message] += 1", "pass"),
-    "late not counted": Bug(
-        filtering.FilterAgent, "_add", "self.counts[refusal] += 1", "pass"
-    ),
+    "late not counted": Bug(filtering.FilterAgent, "_add", "self.counts[refusal] += 1", "pass"),
     "quarantine ignored": Bug(
         teammates.TeammateScreen, "_assess", "teammates), decision.trusted", "teammates), True"
     ),
@@ -57,7 +54,17 @@ BUGS = {
         collaboration.CollaborationAgent, "as_used", "isinstance(help_, Belief)", "False"
     ),
     "limits ignored": Bug(
-        budget.Budget, "admits", "limit.room(now_ns, urgent) >= amount", "urgent or limit.room(now_ns, urgent) >= amount"
+        budget.Budget,
+        "admits",
+        "limit.room(now_ns, urgent) >= amount",
+        "urgent or limit.room(now_ns, urgent) >= amount",
+    ),
+    "naive fusion": Bug(simulator, "team_of", "Settings(budget", "Settings(fusion='naive', budget"),
+    "trust off": Bug(
+        simulator,
+        "team_of",
+        "Settings(budget",
+        "Settings(trust=replace(CollaborationSettings().trust, enabled=False), budget",
     ),
 }
 
@@ -70,7 +77,11 @@ def planted(name: str) -> Iterator[None]:
     text = textwrap.dedent(inspect.getsource(original))
     assert old in text, f"{function} has changed: {old!r} is not in it"
     made: dict[str, Any] = {}
-    exec(compile(text.replace(old, new), inspect.getfile(original), "exec"), original.__globals__, made)
+    exec(
+        compile(text.replace(old, new), inspect.getfile(original), "exec"),
+        original.__globals__,
+        made,
+    )
     setattr(owner, function, made[function])
     try:
         yield

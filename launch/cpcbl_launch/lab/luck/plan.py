@@ -3,7 +3,7 @@
 from random import Random
 
 from cpcbl_launch.lab.luck.history import INSTANT, Event, History, Kind
-from cpcbl_launch.lab.luck.teams import GUESTS, OBSERVER, team_of
+from cpcbl_launch.lab.luck.teams import GUESTS, team_of
 
 DURATION_S, QUIET_S, FIRST_S = 60.0, 25.0, 6.0
 """A history's length, the time without events at its end, and when the first event may begin."""
@@ -49,11 +49,11 @@ def history_of(seed: int, duration_s: float = DURATION_S) -> History:
     """The history of this seed. No event begins on a robot while another of its kind lasts."""
     dice, robots = Random(f"history {seed}"), tuple(team_of(seed).robots)
     last_s = duration_s - min(QUIET_S, duration_s / 2.0)
-    drivers = tuple(name for name in robots if name != OBSERVER)
+    guides = tuple(name for name in robots if name.startswith("guide"))
     at_s, events = FIRST_S, list[Event]()
     while at_s < last_s - LASTS_S[0]:
         kind = dice.choices(list(WEIGHTS), list(WEIGHTS.values()))[0]
-        targets = {"guest": GUESTS, "dark": ("",), "kidnap": drivers}.get(kind, robots)
+        targets = {"guest": GUESTS, "dark": ("",), "kidnap": guides or robots}.get(kind, robots)
         lasts_s = 0.0 if kind in INSTANT else dice.uniform(*LASTS_S)
         until_s = min(at_s + lasts_s, last_s)
         robot = dice.choice(targets)

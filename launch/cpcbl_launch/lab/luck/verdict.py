@@ -8,6 +8,7 @@ from cpcbl_launch.lab.chaos.consistency import Consistency, consistency
 from cpcbl_launch.lab.chaos.history import longest_false_claim_s
 from cpcbl_launch.lab.chaos.run_log import TRACKS_HZ, RunLog
 from cpcbl_launch.lab.luck.history import Event, History, Kind
+from cpcbl_launch.lab.luck.processes import RESTART_S
 from cpcbl_launch.lab.luck.violations import Violation
 from cpcbl_launch.reporting import metrics
 from cpcbl_launch.reporting.metrics import Samples
@@ -26,7 +27,7 @@ UNKNOWABLE: tuple[Kind, ...] = ("liar", "clock-step", "kidnap", "odd-sightings",
 
 def violations(log: RunLog, history: History, team: Team) -> Iterator[Violation]:
     """What did not hold."""
-    yield from _waiting(log, history)
+    yield from _waiting(log, history, team)
     trusted = _without(log, history)
     for name in history.robots:
         false_s = longest_false_claim_s(trusted, name, FALSE_M)
@@ -42,11 +43,11 @@ def violations(log: RunLog, history: History, team: Team) -> Iterator[Violation]
                 yield Violation("consistent", name, history.duration_s, what)
 
 
-def _waiting(log: RunLog, history: History) -> Iterator[Violation]:
+def _waiting(log: RunLog, history: History, team: Team) -> Iterator[Violation]:
     """Robots that do not step, are not localized, are not helped or not trusted in the quiet time
     at the end."""
     healed_s, end_s = history.healed_s, history.duration_s
-    quiet_s = end_s - healed_s
+    quiet_s = end_s - max(healed_s, _silent_until_s(history, team))
     for name in history.robots:
         gap_s = log.longest_track_gap_s(name, healed_s + 2.0, end_s)
         if quiet_s > 3.0 and gap_s > GAP_S:
@@ -63,6 +64,15 @@ def _waiting(log: RunLog, history: History) -> Iterator[Violation]:
                 if trust.reason and trust.peer in history.robots:
                     what = f"{trust.peer} is in quarantine ({trust.reason})"
                     yield Violation("nobody waits", name, end_s, what)
+
+
+def _silent_until_s(history: History, team: Team) -> float:
+    """Until when a restarted robot may have nothing to spend: it cannot know what it spent before,
+    so a whole window of its budget has to pass (docs/routing.md)."""
+    starts_s = [event.until_s + RESTART_S for event in history.of_kind("kill", "clock-step")]
+    budgets = [robot.collaboration.budget for robot in team.robots.values()]
+    is_slow = any(budget.messages_per_minute for budget in budgets)
+    return max(starts_s, default=0.0) + 60.0 if is_slow and starts_s else 0.0
 
 
 def _misses_help(log: RunLog, robot: str, end_s: float) -> bool:
