@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any, NamedTuple
 
-from cpcbl_agents import collaboration, declarations, filtering, node, process
+from cpcbl_agents import declarations, filtering, node, process
 from cpcbl_launch.lab.luck import simulator
 from cpcbl_team import teammates, timeline
 from cpcbl_transport import budget
@@ -38,20 +38,11 @@ BUGS = {
     "budget leak": Bug(
         process, "make_robot", "late or before.moved or before.ran, camera", "False, camera"
     ),
-    "free beliefs": Bug(
-        collaboration.CollaborationAgent,
-        "_affords",
-        "budget.spend(now_ns, size)",
-        "budget.spend(now_ns, size if size < 50 else 0)",
-    ),
     "subscriptions kept": Bug(declarations, "_declare", "declared.pop(key).close()", "pass"),
     "refusal not counted": Bug(node.Node, "_handle_payload", "self.counts[message] += 1", "pass"),
     "late not counted": Bug(filtering.FilterAgent, "_add", "self.counts[refusal] += 1", "pass"),
     "quarantine ignored": Bug(
         teammates.TeammateScreen, "_assess", "teammates), decision.trusted", "teammates), True"
-    ),
-    "equals used whole": Bug(
-        collaboration.CollaborationAgent, "as_used", "isinstance(help_, Belief)", "False"
     ),
     "limits ignored": Bug(
         budget.Budget,

@@ -189,7 +189,7 @@ def luck(
             console.print(shown, highlight=False)
 
     options.print_result(found, as_json, show_tables)
-    if found.failing_seeds:
+    if found.has_failed:
         raise Exit(1)
 
 

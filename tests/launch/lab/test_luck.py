@@ -13,6 +13,7 @@ from cpcbl_launch.lab.luck.history import history_text, read_history
 from cpcbl_launch.lab.luck.outcome import run_history, run_seed
 from cpcbl_launch.lab.luck.plan import history_of
 from cpcbl_launch.lab.luck.shrink import fails_like, shrink
+from cpcbl_launch.lab.luck.sweep import summed
 from cpcbl_team.errors import InputError
 
 FOUND = {
@@ -28,11 +29,10 @@ FOUND_LATER = {
     "refusal not counted": "counted",
     "budget leak": "in budget",
     "limits ignored": "in budget",
-    "free beliefs": "in budget",
-    "equals used whole": "not uphill",
     "quarantine ignored": "quarantined",
 }
-MOST_SEEDS, MOST_EVENTS = 12, 20
+MOST_SEEDS, MOST_EVENTS, POOLED = 15, 20, range(10)
+IN_SUM = "naive fusion", "trust off"
 DIGEST = "from cpcbl_launch.lab.luck.outcome import run_seed; print(run_seed(4, 8.0).digest)"
 
 
@@ -79,8 +79,17 @@ def test_every_planted_bug_is_found(bug: str) -> None:
     assert found_by(bug, FOUND_LATER[bug], MOST_SEEDS) is not None
 
 
+@pytest.mark.long
+@pytest.mark.parametrize("bug", IN_SUM)
+def test_fusion_that_is_too_certain_shows_in_the_sum_of_histories(bug: str) -> None:
+    with planted(bug):
+        found = summed([run_seed(seed, 60.0) for seed in POOLED])
+    assert found.blind_nees > found.blind_nees_bound
+    assert found.has_failed
+
+
 def test_every_planted_bug_has_an_invariant() -> None:
-    assert {*FOUND, *FOUND_LATER} == {*BUGS}
+    assert {*FOUND, *FOUND_LATER, *IN_SUM} == {*BUGS}
 
 
 @pytest.mark.long

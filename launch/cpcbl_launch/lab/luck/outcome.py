@@ -10,7 +10,8 @@ import msgspec
 from cpcbl_launch.lab.luck.history import History, Kind
 from cpcbl_launch.lab.luck.plan import history_of
 from cpcbl_launch.lab.luck.simulator import Simulation
-from cpcbl_launch.lab.luck.verdict import violations
+from cpcbl_launch.lab.luck.teams import is_blind
+from cpcbl_launch.lab.luck.verdict import consistency_of, violations, without_unknowable
 from cpcbl_launch.lab.luck.violations import Violation
 
 
@@ -25,6 +26,8 @@ class Outcome(msgspec.Struct, frozen=True):
     used: int  # inputs that robots used
     events: dict[Kind, int]
     violations: tuple[Violation, ...] = ()
+    blind_nees: float = 0.0  # mean NEES of the blind robots, by their independent samples,
+    blind_samples: float = 0.0  # of which there are so many
 
 
 def run_seed(seed: int, duration_s: float) -> Outcome:
@@ -40,9 +43,15 @@ def run_history(history: History, stop_early: bool = False) -> Outcome:
         broken = run.violations
         if not (stop_early and broken) and all(v.invariant != "no exception" for v in broken):
             broken += tuple(violations(run.log, history, simulation.team))
+    log = without_unknowable(run.log, history)
+    blind = [c for name in history.robots if is_blind(name) and (c := consistency_of(log, name))]
+    samples = sum(c.independent for c in blind)
+    nees = sum(c.nees * c.independent for c in blind) / max(samples, 1.0)
     kinds = Counter(event.kind for event in history.events)
     known = history.seed, len(history.robots), history.duration_s
-    return Outcome(*known, run.digest, sum(run.messages.values()), run.used, dict(kinds), broken)
+    return Outcome(
+        *known, run.digest, sum(run.messages.values()), run.used, dict(kinds), broken, nees, samples
+    )
 
 
 @contextmanager

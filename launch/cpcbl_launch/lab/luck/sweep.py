@@ -8,6 +8,7 @@ import msgspec
 from rich.console import RenderableType
 from rich.table import Table
 
+from cpcbl_launch.lab.chaos.consistency import ALARM, chi_square_quantile
 from cpcbl_launch.lab.experiments.runs import map_in_processes
 from cpcbl_launch.lab.luck.history import History, history_text
 from cpcbl_launch.lab.luck.outcome import Outcome, run_history, run_seed
@@ -15,6 +16,9 @@ from cpcbl_launch.lab.luck.plan import history_of
 from cpcbl_launch.lab.luck.shrink import fails_like, shrink
 from cpcbl_launch.lab.luck.violations import INVARIANTS, Violation
 
+USUAL_BLIND_NEES = 1.1
+"""Of robots that see teammates only: 2 in a linear world, but split covariance intersection and the
+caution about teammates overstate their covariance (docs/luck.md)."""
 SHRUNK = 3  # histories that a command shrinks at most: each takes up to some minutes
 
 
@@ -37,7 +41,13 @@ class Sweep(msgspec.Struct, frozen=True):
     broken: dict[str, int]  # histories by the invariant that did not hold
     failing_seeds: list[int]
     digests: dict[int, str]  # by seed
+    blind_nees: float = 0.0  # mean NEES of all robots that see no landmarks,
+    blind_nees_bound: float = 0.0  # and its bound, by the number of independent samples
     failures: list[Failure] = []
+
+    @property
+    def has_failed(self) -> bool:
+        return bool(self.failing_seeds) or self.blind_nees > self.blind_nees_bound
 
 
 def sweep(
@@ -51,7 +61,7 @@ def sweep(
 def summed(outcomes: Sequence[Outcome]) -> Sweep:
     """The sums over outcomes."""
     broken = Counter(name for o in outcomes for name in {v.invariant for v in o.violations})
-    events = Counter[str]()
+    events, samples = Counter[str](), sum(o.blind_samples for o in outcomes)
     for outcome in outcomes:
         events.update(outcome.events)
     return Sweep(
@@ -63,7 +73,16 @@ def summed(outcomes: Sequence[Outcome]) -> Sweep:
         broken=dict(broken),
         failing_seeds=[o.seed for o in outcomes if o.violations],
         digests={o.seed: o.digest for o in outcomes},
+        blind_nees=sum(o.blind_nees * o.blind_samples for o in outcomes) / max(1.0, samples),
+        blind_nees_bound=nees_bound(samples),
     )
+
+
+def nees_bound(samples: float) -> float:
+    """What consistent robots without landmarks exceed with the probability `ALARM`, by the number
+    of their independent samples."""
+    freedom = 2.0 * max(1.0, samples)
+    return USUAL_BLIND_NEES * chi_square_quantile(freedom, 1.0 - ALARM) / freedom
 
 
 def shrunk_failures(found: Sweep, duration_s: float, folder: Path) -> Iterator[Failure]:
@@ -90,6 +109,10 @@ def tables(found: Sweep) -> Iterator[RenderableType]:
     yield (
         f"{found.histories} histories, {found.team_s:,.0f} s of team time, {found.messages:,}"
         f" messages, {found.used:,} inputs used, {len(found.failing_seeds)} histories failed"
+    )
+    yield (
+        f"NEES of all robots that see no landmarks: {found.blind_nees:.2f}, at most"
+        f" {found.blind_nees_bound:.2f}"
     )
     for failure in found.failures:
         yield "\n".join(failure_lines(failure))

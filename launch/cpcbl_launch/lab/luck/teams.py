@@ -27,7 +27,7 @@ OBSERVER, GUESTS = "observer", ("visitor1", "visitor2")
 SIZES = (3, 6)
 BUDGETS = (
     BudgetSettings(),
-    BudgetSettings(bytes_per_s=100.0),
+    BudgetSettings(bytes_per_s=20.0),
     BudgetSettings(bytes_per_s=300.0),
     BudgetSettings(messages_per_minute=60.0),
 )
@@ -55,6 +55,11 @@ def team_of(seed: int) -> Team:
         map=Field(landmarks=marks),
         simulation=SimulationSettings(step_rate_hz=STEP_HZ),
     )
+
+
+def is_blind(robot: str) -> bool:
+    """Whether a robot of these teams sees no landmarks."""
+    return robot.startswith("blind")
 
 
 def with_world_events(team: Team, history: History) -> Team:

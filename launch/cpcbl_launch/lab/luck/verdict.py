@@ -9,6 +9,7 @@ from cpcbl_launch.lab.chaos.history import longest_false_claim_s
 from cpcbl_launch.lab.chaos.run_log import TRACKS_HZ, RunLog
 from cpcbl_launch.lab.luck.history import Event, History, Kind
 from cpcbl_launch.lab.luck.processes import RESTART_S
+from cpcbl_launch.lab.luck.teams import is_blind
 from cpcbl_launch.lab.luck.violations import Violation
 from cpcbl_launch.reporting import metrics
 from cpcbl_launch.reporting.metrics import Samples
@@ -28,7 +29,7 @@ UNKNOWABLE: tuple[Kind, ...] = ("liar", "clock-step", "kidnap", "odd-sightings",
 def violations(log: RunLog, history: History, team: Team) -> Iterator[Violation]:
     """What did not hold."""
     yield from _waiting(log, history, team)
-    trusted = _without(log, history)
+    trusted = without_unknowable(log, history)
     for name in history.robots:
         false_s = longest_false_claim_s(trusted, name, FALSE_M)
         if false_s > FALSE_S:
@@ -77,11 +78,10 @@ def _silent_until_s(history: History, team: Team) -> float:
 
 def _misses_help(log: RunLog, robot: str, end_s: float) -> bool:
     """Whether a robot that sees no landmark received no help lately."""
-    is_blind = robot.startswith("blind")
-    return is_blind and log.counts_between(robot, end_s - HELP_S)["messages_received"] == 0
+    return is_blind(robot) and log.counts_between(robot, end_s - HELP_S)["messages_received"] == 0
 
 
-def _without(log: RunLog, history: History) -> RunLog:
+def without_unknowable(log: RunLog, history: History) -> RunLog:
     """The log without the tracks of robots that said that they were lost, and without those of
     times of which no robot can know that its inputs or its help are wrong."""
     spans = [_span(event) for event in history.of_kind(*UNKNOWABLE)]
