@@ -123,9 +123,6 @@ WAYS = {
         EXPERIMENT, "long", "--seeds 1", shows=("one liar, 2 honest",)
     ),
     "cpcbl-team experiment luck": Way("histories", "trial", "--seeds 1 --duration 8 --jobs 1"),
-    "cpcbl-team experiment luck --seeds 20": Way(
-        "histories", "trial", "--duration 8 --jobs 1", instead=("--seeds 20", "--seeds 1")
-    ),
     "cpcbl-team experiment one-way-vs-both": Way(
         EXPERIMENT, "trial", "--team-sizes 2 --seeds 1", shows=("robots that move",)
     ),

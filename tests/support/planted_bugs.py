@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any, NamedTuple
 
-from cpcbl_agents import declarations, filtering, node, process
+from cpcbl_agents import declarations, filtering, node
 from cpcbl_launch.lab.luck import simulator
 from cpcbl_team import teammates, timeline
 from cpcbl_transport import budget
@@ -35,16 +35,13 @@ BUGS = {
         timeline.Timeline, "add", "keys[index] == key:", "keys[index] == key and not keys:"
     ),
     "late data": Bug(timeline.Timeline, "add", "key[0] < keys[-1][0] - self._horizon_ns", "False"),
-    "budget leak": Bug(
-        process, "make_robot", "late or before.moved or before.ran, camera", "False, camera"
-    ),
     "subscriptions kept": Bug(declarations, "_declare", "declared.pop(key).close()", "pass"),
     "refusal not counted": Bug(node.Node, "_handle_payload", "self.counts[message] += 1", "pass"),
     "late not counted": Bug(filtering.FilterAgent, "_add", "self.counts[refusal] += 1", "pass"),
     "quarantine ignored": Bug(
         teammates.TeammateScreen, "_assess", "teammates), decision.trusted", "teammates), True"
     ),
-    "limits ignored": Bug(
+    "budget leak": Bug(
         budget.Budget,
         "admits",
         "limit.room(now_ns, urgent) >= amount",

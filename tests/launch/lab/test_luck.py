@@ -28,7 +28,6 @@ FOUND_LATER = {
     "late data": "not too late",
     "refusal not counted": "counted",
     "budget leak": "in budget",
-    "limits ignored": "in budget",
     "quarantine ignored": "quarantined",
 }
 MOST_SEEDS, MOST_EVENTS, POOLED = 15, 20, range(10)

@@ -66,7 +66,9 @@ class Simulation:
         self._field_node = FieldNode(self._field, network.session(FIELD))
         self._listen(network.session(WATCHER))
         self.robots = {
-            name: RobotProcess(name, self.team, network, clock, self._report, self._liar(name))
+            name: RobotProcess(
+                name, self.team, network, clock, self._report, self._faulty_bus(name)
+            )
             for name, clock in clocks.items()
         }
         self._guests: dict[str, GuestProcess] = {}
@@ -156,7 +158,7 @@ class Simulation:
     def _leave(self, name: str) -> None:
         self._guests.pop(name).leave()
 
-    def _liar(self, name: str) -> Callable[[Bus], Bus]:
+    def _wrapper(self, name: str) -> Callable[[Bus], Bus]:
         """What stands between a robot and its bus: where it lies, its help is shifted."""
         lies = [e for e in self._history.of_kind("liar") if e.robot == name]
         if not lies:

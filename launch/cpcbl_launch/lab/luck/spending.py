@@ -12,7 +12,7 @@ from cpcbl_transport.compact import sent_bytes
 DRIFT = 1e-3  # windows are of the robot's clock
 
 
-class _Window:
+class Window:
     """What was spent within a window."""
 
     def __init__(self, unit: str, most: float, window_s: float) -> None:
@@ -36,7 +36,7 @@ class SpendingMonitor:
     def __init__(self, team: Team, network: Network, report: Report) -> None:
         self._network, self._report = network, report
         self._windows = {
-            name: _windows(robot.collaboration.budget) for name, robot in team.robots.items()
+            name: budget_windows(robot.collaboration.budget) for name, robot in team.robots.items()
         }
 
     def note(self, robot: str, key: str, payload: bytes) -> None:
@@ -51,12 +51,13 @@ class SpendingMonitor:
                 self._report("in budget", robot, what)
 
 
-def _windows(budget: BudgetSettings) -> list[_Window]:
+def budget_windows(budget: BudgetSettings) -> list[Window]:
+    """The windows of a budget, empty so far."""
     windows = []
     if budget.bytes_per_s:
         _, window_s = bytes_window(budget.bytes_per_s)
-        windows.append(_Window("bytes", budget.bytes_per_s * window_s, window_s))
+        windows.append(Window("bytes", budget.bytes_per_s * window_s, window_s))
     if rate := budget.messages_per_minute:
         most = math.ceil(rate)
-        windows.append(_Window("messages", most, 60.0 * most / rate))
+        windows.append(Window("messages", most, 60.0 * most / rate))
     return windows

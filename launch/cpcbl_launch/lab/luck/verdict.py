@@ -9,6 +9,7 @@ from cpcbl_launch.lab.chaos.history import longest_false_claim_s
 from cpcbl_launch.lab.chaos.run_log import TRACKS_HZ, RunLog
 from cpcbl_launch.lab.luck.history import Event, History, Kind
 from cpcbl_launch.lab.luck.processes import RESTART_S
+from cpcbl_launch.lab.luck.spending import budget_windows
 from cpcbl_launch.lab.luck.teams import is_blind
 from cpcbl_launch.lab.luck.violations import Violation
 from cpcbl_launch.reporting import metrics
@@ -71,9 +72,12 @@ def _silent_until_s(history: History, team: Team) -> float:
     """Until when a restarted robot may have nothing to spend: it cannot know what it spent before,
     so a whole window of its budget has to pass (docs/routing.md)."""
     starts_s = [event.until_s + RESTART_S for event in history.of_kind("kill", "clock-step")]
-    budgets = [robot.collaboration.budget for robot in team.robots.values()]
-    is_slow = any(budget.messages_per_minute for budget in budgets)
-    return max(starts_s, default=0.0) + 60.0 if is_slow and starts_s else 0.0
+    windows_s = [
+        window.window_s
+        for robot in team.robots.values()
+        for window in budget_windows(robot.collaboration.budget)
+    ]
+    return max(starts_s) + max(windows_s) if starts_s and windows_s else 0.0
 
 
 def _misses_help(log: RunLog, robot: str, end_s: float) -> bool:
