@@ -83,7 +83,7 @@ net: setup
 
 # A day of team time with bad luck (docs/luck.md), with the compiled core if `make compiled` made it.
 luck: setup
-	PYTHONPATH=$(COMPILED) $(BIN)/cpcbl-team experiment luck --seeds 1440 --output build
+	PYTHONPATH=agents:transport:launch:$(COMPILED) $(BIN)/cpcbl-team experiment luck --seeds 1440 --output build
 
 # Meaningless payloads on every key of a running team: some minutes.
 fuzz: setup

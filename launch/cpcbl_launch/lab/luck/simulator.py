@@ -66,9 +66,7 @@ class Simulation:
         self._field_node = FieldNode(self._field, network.session(FIELD))
         self._listen(network.session(WATCHER))
         self.robots = {
-            name: RobotProcess(
-                name, self.team, network, clock, self._report, self._faulty_bus(name)
-            )
+            name: RobotProcess(name, self.team, network, clock, self._report, self._wrapper(name))
             for name, clock in clocks.items()
         }
         self._guests: dict[str, GuestProcess] = {}
