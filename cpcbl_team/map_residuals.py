@@ -7,7 +7,7 @@ largest is that of the wrong one, if it was seen from many sides.
 """
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import Final, NamedTuple
 
 from cpcbl_team.constraints import NEAREST_M, circle, heading
@@ -18,19 +18,6 @@ PRIOR: Final = 1.0  # 1/m^2: of an offset before anything was read
 LEAST_CHI_SQUARE: Final = 40.0  # of an offset, against none,
 LEAST_RATIO: Final = 1.5  # and against that of any other object
 FARTHEST: Final = 100.0  # squared sigmas: beyond, a reading is an outlier
-
-
-class Reading(NamedTuple):
-    """A landmark as it was seen from an estimated pose; the sensor's sigmas."""
-
-    name: str
-    dx: float  # from the robot to its place on the map, in the field's frame, m
-    dy: float
-    heading: float  # of the robot, rad
-    range_m: float | None
-    bearing_rad: float | None
-    range_sigma_m: float
-    bearing_sigma_rad: float
 
 
 class Offset(NamedTuple):
@@ -44,33 +31,6 @@ class Offset(NamedTuple):
     readings: float = 0.0
     squares: float = 0.0  # the sum of their residuals' squares, in sigmas
 
-    def plus(self, r: Reading) -> "Offset":
-        """With one more reading."""
-        distance = math.hypot(r.dx, r.dy)
-        if distance < NEAREST_M:
-            return self
-        rows = []
-        if r.range_m is not None:
-            rows.append((circle(r.dx, r.dy, distance, r.range_m), r.range_sigma_m))
-        if r.bearing_rad is not None:
-            row = heading(r.dx, r.dy, distance * distance, r.bearing_rad, r.heading)
-            rows.append((row, r.bearing_sigma_rad))
-        xx, xy, yy, x, y, readings, squares = self
-        for (u, v, residual), sigma in rows:
-            weight = 1.0 / max(sigma * sigma, 1e-12)
-            if weight * residual * residual > FARTHEST:
-                return self
-            xx, xy, yy = xx + weight * u * u, xy + weight * u * v, yy + weight * v * v
-            x, y = x + weight * u * residual, y + weight * v * residual
-            readings, squares = readings + 1.0, squares + weight * residual * residual
-        return new(Offset, (xx, xy, yy, x, y, readings, squares))
-
-    def faded(self) -> "Offset":
-        """With all that was read before the present block counting less."""
-        xx, xy, yy, *rest = (KEPT * n for n in self)
-        prior = (1.0 - KEPT) * PRIOR
-        return new(Offset, (xx + prior, xy, yy + prior, *rest))
-
     @property
     def chi_square(self) -> float:
         """How much better the offset explains the readings than none does."""
@@ -78,6 +38,7 @@ class Offset(NamedTuple):
         return (yy * x * x - 2.0 * xy * x * y + xx * y * y) / (xx * yy - xy * xy)
 
 
+NO_OFFSET: Final = Offset()
 _NONE: Final[Mapping[str, Offset]] = {}
 
 
@@ -85,13 +46,6 @@ class MapResiduals(NamedTuple):
     """The offsets of the objects of a map from their places."""
 
     of_object: Mapping[str, Offset] = _NONE
-
-    def plus(self, readings: Iterable[Reading]) -> "MapResiduals":
-        """With the readings of one more block."""
-        of_object = {name: offset.faded() for name, offset in self.of_object.items()}
-        for reading in readings:
-            of_object[reading.name] = of_object.get(reading.name, Offset()).plus(reading)
-        return MapResiduals(of_object)
 
     def misplaced(self) -> str:
         """The object that must stand elsewhere than on the map; empty if there is none."""
@@ -106,3 +60,78 @@ class MapResiduals(NamedTuple):
 
 
 NO_RESIDUALS: Final = MapResiduals()
+
+
+class OffsetSums:
+    """The normal equations of the offset of one object, to which readings are added."""
+
+    def __init__(self, before: Offset) -> None:
+        self.xx, self.xy, self.yy, self.x, self.y, self.readings, self.squares = before
+
+    def fade(self) -> None:
+        """Makes all that was read before the present block count less."""
+        prior = (1.0 - KEPT) * PRIOR
+        self.xx, self.xy, self.yy = KEPT * self.xx + prior, KEPT * self.xy, KEPT * self.yy + prior
+        self.x, self.y = KEPT * self.x, KEPT * self.y
+        self.readings, self.squares = KEPT * self.readings, KEPT * self.squares
+
+    def add(self, u: float, v: float, residual: float, weight: float) -> None:
+        """Adds a reading that the offset (x, y) changes by u x + v y."""
+        self.xx += weight * u * u
+        self.xy += weight * u * v
+        self.yy += weight * v * v
+        self.x += weight * u * residual
+        self.y += weight * v * residual
+        self.readings += 1.0
+        self.squares += weight * residual * residual
+
+    def offset(self) -> Offset:
+        sums = self.xx, self.xy, self.yy, self.x, self.y, self.readings, self.squares
+        return new(Offset, sums)
+
+
+class ResidualSums:
+    """Adds the readings of one more block to what the blocks before have told."""
+
+    def __init__(self, before: MapResiduals) -> None:
+        self._of_object = {name: OffsetSums(offset) for name, offset in before.of_object.items()}
+        for sums in self._of_object.values():
+            sums.fade()
+
+    def add(
+        self,
+        name: str,
+        dx: float,
+        dy: float,
+        heading_rad: float,
+        range_m: float | None,
+        bearing_rad: float | None,
+        range_sigma_m: float,
+        bearing_sigma_rad: float,
+    ) -> None:
+        """Adds what was read of an object that is (dx, dy) from the robot on the map (m, in the
+        field's frame), with the robot's heading there and the sigmas of the sensor. An outlier,
+        and an object that is too near to have a direction, tell nothing."""
+        sums = self._of_object.get(name)
+        if sums is None:
+            sums = self._of_object[name] = OffsetSums(NO_OFFSET)
+        distance = math.hypot(dx, dy)
+        if distance < NEAREST_M:
+            return
+        u, v, residual, weight = 0.0, 0.0, 0.0, 0.0
+        if range_m is not None:
+            u, v, residual = circle(dx, dy, distance, range_m)
+            weight = 1.0 / max(range_sigma_m * range_sigma_m, 1e-12)
+            if weight * residual * residual > FARTHEST:
+                return
+        if bearing_rad is not None:
+            across, along, turn = heading(dx, dy, distance * distance, bearing_rad, heading_rad)
+            of_bearing = 1.0 / max(bearing_sigma_rad * bearing_sigma_rad, 1e-12)
+            if of_bearing * turn * turn > FARTHEST:
+                return
+            sums.add(across, along, turn, of_bearing)
+        if range_m is not None:
+            sums.add(u, v, residual, weight)
+
+    def residuals(self) -> MapResiduals:
+        return MapResiduals({name: sums.offset() for name, sums in self._of_object.items()})

@@ -12,7 +12,7 @@ from cpcbl_team.constant_errors import NO_ERRORS, NO_EVIDENCE, pose_offset
 from cpcbl_team.estimate import POSE, offset_pose
 from cpcbl_team.geometry import new
 from cpcbl_team.landmarks import Landmarks, LandmarkUpdate
-from cpcbl_team.map_residuals import Reading
+from cpcbl_team.map_residuals import ResidualSums
 from cpcbl_team.measurements import GatedObject
 from cpcbl_team.miscalibration import (
     AS_CONFIGURED,
@@ -139,17 +139,22 @@ class OwnCalibration:
         if math.hypot(*moved) < LEAST_DISTANCE_M:
             return state
         field_from_odometry = state.estimate.pose @ place.inverse()
-        pieces = [e for e in recovery.evidence if not e.from_teammate]
+        pieces, since_ns = list(recovery.evidence), begin.stamp_ns
         for snapshot in recovery.snapshots:
-            if snapshot[0] > begin.stamp_ns:
+            if snapshot[0] > since_ns:
                 pieces += self._landmarks.evidence_of(snapshot, memory.adaptation)
-        readings, k = [], 1.0 / math.sqrt(self._independent_frames)
+        sums, k = ResidualSums(memory.residuals), 1.0 / math.sqrt(self._independent_frames)
+        last_ns, here = -1, state.estimate.pose  # all pieces of a frame have one place
         for e in pieces:
-            if e.stamp_ns > begin.stamp_ns and e.source in self._names_of_landmarks:
-                x, y, heading = field_from_odometry @ e.odometry_from_robot
-                seen = e.range_m, e.bearing_rad, k * e.range_sigma_m, k * e.bearing_sigma_rad
-                readings.append(Reading(e.source, e.x - x, e.y - y, heading, *seen))
-        return _with_calibration(state, memory._replace(residuals=memory.residuals.plus(readings)))
+            stamp_ns, then, name, x, y, range_m, bearing, sigma_m, sigma_rad, _, by_mate, _, _ = e
+            if stamp_ns <= since_ns or by_mate or name not in self._names_of_landmarks:
+                continue
+            if stamp_ns != last_ns:
+                last_ns, here = stamp_ns, field_from_odometry @ then
+            here_x, here_y, heading = here
+            dx, dy = x - here_x, y - here_y
+            sums.add(name, dx, dy, heading, range_m, bearing, k * sigma_m, k * sigma_rad)
+        return _with_calibration(state, memory._replace(residuals=sums.residuals()))
 
     def _with_ranges(self, state: State) -> State:
         """The state that has compared distances between landmarks with the map, once a block."""
