@@ -53,7 +53,7 @@ def history_of(seed: int, duration_s: float = DURATION_S) -> History:
     at_s, events = FIRST_S, list[Event]()
     while at_s < last_s - LASTS_S[0]:
         kind = dice.choices(list(WEIGHTS), list(WEIGHTS.values()))[0]
-        targets = {"guest": GUESTS, "dark": ("",), "kidnap": guides or robots}.get(kind, robots)
+        targets = {"guest": GUESTS, "dark": ("",), "kidnap": guides or ("",)}.get(kind, robots)
         lasts_s = 0.0 if kind in INSTANT else dice.uniform(*LASTS_S)
         until_s = min(at_s + lasts_s, last_s)
         robot = dice.choice(targets)
