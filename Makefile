@@ -8,7 +8,7 @@ BIN = $(VENV)/bin
 export PYTHONDONTWRITEBYTECODE =
 
 .PHONY: setup demo test quick check unit test-long test-recordings test-ros2 test-trial test-compiled test-docker test-bench \
-  chaos net recording fuzz compiled bench bench-degraded bench-detection bench-latency bench-pictures \
+  chaos net recording fuzz luck compiled bench bench-degraded bench-detection bench-latency bench-pictures \
   bench-processes bench-scaling bench-view bench-pairs screenshot clean
 
 setup: $(VENV)/ready
@@ -90,6 +90,10 @@ chaos: setup
 # The net proves that a refactoring changes no bit; see tests/net/test_net.py.
 net: setup
 	PYTHONPATH=$(BENCH_PATH) $(BIN)/python -m net.reference
+
+# A day of team time with bad luck (docs/luck.md), with the compiled core if `make compiled` made it.
+luck: setup
+	PYTHONPATH=agents:transport:launch:$(COMPILED) $(BIN)/cpcbl-team experiment luck --seeds 1440 --output build
 
 # Meaningless payloads on every key of a running team: some minutes.
 fuzz: setup

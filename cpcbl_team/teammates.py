@@ -182,6 +182,10 @@ class TeammateScreen:
         now_ns, rules = item.stamp_ns, self._collaboration
         if self.is_active and not self.has_recent_reports(before, now_ns):
             return True
+        earlier_ns, later_ns = (s.memory.teammates.last_report_ns for s in (before, after))
+        begin = before.memory.calibration.check.begin  # of a block without any report, perhaps
+        if begin is not None and earlier_ns < begin.stamp_ns <= later_ns:
+            return True
         if isinstance(item, Position) or all(s.id != robot for s in item.sightings):
             return False
         old, new = (state.memory.teammates.beliefs.get(robot, ()) for state in (before, after))

@@ -102,6 +102,7 @@ WAYS = {
     ),
     "cpcbl-team experiment liars": Way(EXPERIMENT, "long", "--seeds 1"),
     "cpcbl-team experiment liars --seeds 4": Way(EXPERIMENT, "long", "--seeds 1", shows=LIAR),
+    "cpcbl-team experiment luck": Way("histories", "trial", "--seeds 1 --duration 8 --jobs 1"),
     "cpcbl-team experiment one-way-vs-both": Way(
         EXPERIMENT, "trial", "--team-sizes 2 --seeds 1", shows=("robots that move",)
     ),

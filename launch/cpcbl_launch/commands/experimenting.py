@@ -7,7 +7,8 @@ from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Optional
 
-from typer import Argument, Context, Option, Typer
+from msgspec.structs import replace
+from typer import Argument, Context, Exit, Option, Typer
 
 from cpcbl_launch.commands import options
 from cpcbl_launch.team.requirements import require_matplotlib, require_opencv
@@ -151,6 +152,53 @@ def worlds(
     cases = partial(experiment.cases, options.parse_names(names), options.parse_names(variants))
     where = options.workers(jobs, cluster)
     conduct(experiment.EXPERIMENT._replace(cases=cases), seeds, where, output, as_json)
+
+
+@experiment_app.command("luck")
+def luck(
+    seeds: Annotated[int, Option(min=1, help="Histories, each of its own seed.")] = 20,
+    from_seed: Annotated[int, Option(min=0, help="The first seed.")] = 0,
+    duration: Annotated[
+        float, Option(callback=options.duration, help="Seconds of each history.")
+    ] = 60.0,
+    replay: Annotated[
+        Optional[Path], Option(help="Run this one history, such as luck-17.json.")
+    ] = None,
+    jobs: options.Jobs = None,
+    cluster: options.Cluster = "",
+    output: Annotated[Path, Option(help="Folder for failing histories, luck-SEED.json.")] = Path(),
+    as_json: options.AsJson = False,
+) -> None:
+    """Simulated bad luck: networks, clocks and members that fail, and what must hold of any robot.
+    A failing history is shrunk and written; the exit code is then 1."""
+    from rich.console import Console
+
+    from cpcbl_launch.lab.luck import sweep as luck
+    from cpcbl_launch.lab.luck.history import read_history
+    from cpcbl_launch.lab.luck.outcome import run_history
+    from cpcbl_launch.views.run import progress_bar
+
+    options.require_folder("--output", output)
+    if replay is not None:
+        history = read_history(replay)
+        found = luck.summed([outcome := run_history(history)])
+        failures = [luck.Failure(history, outcome.violations)]
+    else:
+        chosen, finished = range(from_seed, from_seed + seeds), count(1)
+        with progress_bar(f"luck, {seeds} histories", quiet=False) as show:
+            where = options.workers(jobs, cluster)
+            found = luck.sweep(chosen, duration, where, lambda: show(next(finished) / seeds))
+        failures = list(luck.shrunk_failures(found, duration, output))
+    found = replace(found, failures=failures)
+
+    def show_tables() -> None:
+        console = Console()
+        for shown in luck.tables(found):
+            console.print(shown, highlight=False)
+
+    options.print_result(found, as_json, show_tables)
+    if found.has_failed:
+        raise Exit(1)
 
 
 MOVED = {

@@ -1,0 +1,235 @@
+"""What one process of a robot does, held against rules that have no exception.
+
+The witness sees each message that the bus delivers, each that the robot handles, and each input
+that its timeline takes; it compares them with what the robot itself counts. What it needs to know
+of tiers and subscriptions it takes from the bus, not from the robot.
+"""
+
+from collections.abc import Callable
+from itertools import pairwise
+
+import msgspec
+
+from cpcbl_agents.agent import BusEvent, Tick
+from cpcbl_agents.filtering import FilterAgent
+from cpcbl_agents.inbox import INBOX
+from cpcbl_agents.node import Node
+from cpcbl_agents.robot import Robot
+from cpcbl_launch.lab.luck.network import HELP, Network
+from cpcbl_team.config import Team
+from cpcbl_team.inputs import Belief, Fix, HeadingBelief, Input, Odometry
+from cpcbl_team.state import FIX, State
+from cpcbl_team.teammates import MOST_SENDERS
+from cpcbl_team.timeline import HORIZON_NS, Timeline, TimelineRefusal
+from cpcbl_transport import topics
+from cpcbl_transport.compact import decode_help
+from cpcbl_transport.messages import Message, Outgoing, Refusal, Status
+
+KEPT_NS = 10_000_000_000  # what was used is remembered for so long
+LATEST_NS = HORIZON_NS + 600_000_000  # a belief counts from half a second before its stamp
+ORDER_EVERY_S = 7  # statuses: the order of inputs is checked once in so many
+OWN_KEYS = 24  # publishers of a robot beside its fixes
+Report = Callable[[str, str, str], None]  # called with an invariant, the robot and what was wrong
+
+
+class Witness:
+    """Watches one process of the robot `name`."""
+
+    def __init__(self, name: str, team: Team, network: Network, report: Report) -> None:
+        self._name, self._team, self._network, self._report = name, team, network, report
+        self.delivered = self.handled = self.helped = self.used = 0
+        self._help_tiers: dict[tuple[type, str, int], int] = {}
+        self._used: dict[Input, int] = {}
+        self._newest_ns = 0
+        self._checks = 0
+        self._most = len(team.robots) + team.guests.most
+
+    def watch(self, robot: Robot) -> Robot:
+        """The robot, whose messages and inputs the witness sees from now on."""
+        return _WatchedRobot(robot, self)
+
+    def _fail(self, invariant: str, what: str) -> None:
+        self._report(invariant, self._name, what)
+
+    # Messages -----------------------------------------------------------------------------------
+
+    def note_delivery(self, key: str, payload: bytes) -> None:
+        self.delivered += 1
+        if key.startswith(HELP):
+            message = decode_help(key, payload)
+            if not isinstance(message, Refusal):
+                names = topics.FIX.names(key) or topics.BELIEF.names(key) or {}
+                self._help_tiers[_identity(message)] = int(names["tier"])
+
+    def note_handled(self, message: Message) -> None:
+        self.handled += 1
+        self.helped += isinstance(message, Belief | Fix)
+
+    def note_input(self, item: Input, is_used: bool, counted: int) -> None:
+        """The timeline took an input or did not; `counted`: how many refusals were counted."""
+        if counted != (not is_used):
+            word = "used" if is_used else "refused"
+            self._fail(
+                "counted", f"{_text(item)} was {word} and counted {counted} times as refused"
+            )
+        if not is_used:
+            return
+        self.used += 1
+        plain = Belief(*msgspec.structs.astuple(item)) if isinstance(item, HeadingBelief) else item
+        if plain in self._used:
+            self._fail("used once", f"{_text(item)} was used twice")
+        self._used[plain] = item.stamp_ns
+        if item.stamp_ns < self._newest_ns - LATEST_NS:
+            late_s = (self._newest_ns - item.stamp_ns) * 1e-9
+            self._fail("not too late", f"{_text(item)} was used {late_s:.2f} s after a newer input")
+        self._newest_ns = max(self._newest_ns, _measured_ns(item))
+        if isinstance(item, Fix | Belief):
+            self._check_direction(item)
+
+    def _check_direction(self, item: Fix | Belief) -> None:
+        theirs, own = self._help_tiers.get(_identity(item)), self.tier
+        if theirs is None or own is None or isinstance(item, HeadingBelief):
+            return
+        if theirs >= own:
+            self._fail("not uphill", f"{_text(item)} of tier {theirs} was used in tier {own}")
+
+    @property
+    def tier(self) -> int | None:
+        """The tier that the robot announces on the bus."""
+        tokens = self._network.declared[self._name]["tokens"]
+        tiers = [int(names["tier"]) for key in tokens if (names := topics.ALIVE.names(key))]
+        return tiers[-1] if tiers else None
+
+    # Once a second ------------------------------------------------------------------------------
+
+    def check(self, node: Node, status: Status) -> None:
+        """Compares what the robot counts and keeps with what the witness has seen."""
+        state = node.robot.filter.timeline.state
+        self._check_counts(node)
+        self._check_subscriptions()
+        self._check_sizes(node, state)
+        self._check_quarantine(state, status)
+        self._checks += 1
+        if self._checks % ORDER_EVERY_S == 0:
+            self.check_order(node.robot.filter.timeline)
+            self._forget()
+
+    def _check_counts(self, node: Node) -> None:
+        refused = sum(node.counts[reason] for reason in (*Refusal, "inbox_overflow"))
+        missing = self.delivered - refused - node.counts["frame_skipped"] - self.handled
+        if node.waiting:  # in the middle of a step, or after a pause
+            if not 0 <= missing <= INBOX + 1:
+                self._fail("bounded", f"{missing} messages wait")
+        elif missing:
+            self._fail(
+                "counted",
+                f"{self.delivered} messages were delivered, {self.handled} handled and"
+                f" {refused} counted as refused",
+            )
+        received = sum(flow.messages for flow in node.received.flows())
+        if received != self.helped:
+            self._fail("counted", f"{self.helped} messages of help came, {received} were counted")
+
+    def _check_subscriptions(self) -> None:
+        """A robot subscribes to fixes of better tiers alone, and to one tier of a teammate's
+        beliefs."""
+        own = self.tier
+        keys = self._network.declared[self._name]["subscriptions"]
+        fixes = [int(n["tier"]) for key in keys if (n := topics.FIX.names(key))]
+        beliefs = [(n["robot"], int(n["tier"])) for key in keys if (n := topics.BELIEF.names(key))]
+        worst = max([*fixes, *(tier - 1 for _, tier in beliefs)], default=-1)
+        if own is not None and worst >= own:
+            self._fail("not uphill", f"it subscribes to tier {worst} or worse, in tier {own}")
+        if len({robot for robot, _ in beliefs}) < len(beliefs) or len(set(keys)) < len(keys):
+            self._fail("bounded", f"it subscribes twice to the same: {sorted(keys)}")
+
+    def _check_sizes(self, node: Node, state: State) -> None:
+        declared = {what: len(keys) for what, keys in self._network.declared[self._name].items()}
+        most = {"subscriptions": 32 + self._most, "publishers": OWN_KEYS + 16 * self._most}
+        sizes = {
+            "tokens": (declared["tokens"], 1),
+            "subscriptions": (declared["subscriptions"], most["subscriptions"]),
+            "publishers": (declared["publishers"], most["publishers"]),
+            "records of senders": (len(state.memory.teammates.senders), MOST_SENDERS + 1),
+            "senders of beliefs": (len(state.memory.teammates.beliefs), MOST_SENDERS),
+            "watched robots": (len(node.robot.collaboration.guests.watched_robots), self._most),
+        }
+        for what, (number, bound) in sizes.items():
+            if number > bound:
+                self._fail("bounded", f"{number} {what}, at most {bound}")
+
+    def _check_quarantine(self, state: State, status: Status) -> None:
+        """Nothing of a teammate in quarantine was used since it began."""
+        uses = state.updates.objects_ns
+        for name, record in state.memory.teammates.senders.items():
+            if not record.reason:
+                continue
+            used_ns = max(uses.get(name, 0), uses.get(FIX + name, 0))
+            if used_ns > record.since_ns:
+                late_s = (used_ns - record.since_ns) * 1e-9
+                self._fail("quarantined", f"{name} was used {late_s:.2f} s after its quarantine")
+
+    def check_order(self, timeline: Timeline) -> None:
+        """Each state that the timeline keeps is what its input makes of the one before, and inputs
+        are in the order of their times."""
+        keys, inputs, states = timeline._keys, timeline._inputs, timeline._states
+        for n, (before, after) in enumerate(pairwise(states)):
+            if n and keys[n] < keys[n - 1]:
+                self._fail("in order", f"{_text(inputs[n])} comes after {_text(inputs[n - 1])}")
+            elif timeline._apply(inputs[n], before) != after:
+                self._fail("in order", f"{_text(inputs[n])} gives another state than the kept one")
+            else:
+                continue
+            return
+
+    def _forget(self) -> None:
+        old_ns = self._newest_ns - KEPT_NS
+        self._used = {item: at_ns for item, at_ns in self._used.items() if at_ns > old_ns}
+        known = self._help_tiers.items()
+        self._help_tiers = {name: tier for name, tier in known if name[2] > old_ns}
+
+
+def _identity(message: Belief | Fix) -> tuple[type, str, int]:
+    """What tells a message of help from others, whatever it is used for."""
+    is_fix = isinstance(message, Fix)
+    sender = message.observer if isinstance(message, Fix) else message.robot
+    return Fix if is_fix else Belief, sender, message.stamp_ns
+
+
+def _measured_ns(item: Input) -> int:
+    return item.from_ns if isinstance(item, Odometry) else item.stamp_ns
+
+
+def _text(item: Input) -> str:
+    """An input for people."""
+    sender = f" of {item.observer}" if isinstance(item, Fix) else ""
+    sender = f" of {item.robot}" if isinstance(item, Belief) else sender
+    return f"{type(item).__name__}{sender} ({item.stamp_ns * 1e-9:.3f} s)"
+
+
+class _WatchedRobot(Robot):
+    """A robot whose messages a witness sees."""
+
+    def __init__(self, robot: Robot, witness: Witness) -> None:
+        vars(self).update(vars(robot))
+        self.filter, self._witness = _WatchedFilter(robot.filter, witness), witness
+
+    def handle(self, message: Message | Tick | BusEvent, now_ns: int) -> list[Outgoing]:
+        if isinstance(message, Message):
+            self._witness.note_handled(message)
+        return super().handle(message, now_ns)
+
+
+class _WatchedFilter(FilterAgent):
+    """A filter agent whose inputs a witness sees."""
+
+    def __init__(self, watched: FilterAgent, witness: Witness) -> None:
+        vars(self).update(vars(watched))
+        self._witness = witness
+
+    def _add(self, item: Input) -> bool:
+        before = sum(self.counts[reason] for reason in TimelineRefusal)
+        is_used = super()._add(item)
+        counted = sum(self.counts[reason] for reason in TimelineRefusal) - before
+        self._witness.note_input(item, is_used, counted)
+        return is_used

@@ -1,0 +1,111 @@
+"""The simulator of bad luck: usual histories hold, planted bugs are found and shrunk."""
+
+import os
+import pickle
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from support.planted_bugs import BUGS, planted
+
+from cpcbl_launch.lab.luck.history import history_text, read_history
+from cpcbl_launch.lab.luck.outcome import run_history, run_seed
+from cpcbl_launch.lab.luck.plan import history_of
+from cpcbl_launch.lab.luck.shrink import fails_like, shrink
+from cpcbl_launch.lab.luck.sweep import summed
+from cpcbl_team.errors import InputError
+
+FOUND = {
+    "ordering": "in order",
+    "double count": "used once",
+    "subscriptions kept": "not uphill",
+    "late not counted": "counted",
+}
+"""Planted bugs, by the invariant that finds each within the first seed."""
+FOUND_LATER = {
+    "kept states": "in order",
+    "late data": "not too late",
+    "refusal not counted": "counted",
+    "budget leak": "in budget",
+    "quarantine ignored": "quarantined",
+}
+MOST_SEEDS, MOST_EVENTS, POOLED = 15, 20, range(10)
+IN_SUM = "naive fusion", "trust off"
+DIGEST = "from cpcbl_launch.lab.luck.outcome import run_seed; print(run_seed(4, 8.0).digest)"
+
+
+def found_by(bug: str, invariant: str, seeds: int) -> int | None:
+    """The first seed whose history shows the bug by this invariant."""
+    with planted(bug):
+        for seed in range(seeds):
+            broken = run_history(history_of(seed), stop_early=True).violations
+            if invariant in {violation.invariant for violation in broken}:
+                return seed
+    return None
+
+
+def test_a_usual_history_holds_and_its_outcome_can_be_sent() -> None:
+    outcome = run_seed(0, 12.0)
+    assert outcome.violations == ()
+    assert outcome.used > 300
+    assert pickle.loads(pickle.dumps(outcome)) == outcome
+
+
+def test_the_digest_does_not_depend_on_the_hash_seed() -> None:
+    digests = set()
+    for hash_seed in ("1", "2"):
+        environment = {
+            **os.environ,
+            "PYTHONHASHSEED": hash_seed,
+            "PYTHONPATH": os.pathsep.join(sys.path),
+        }
+        done = subprocess.run(
+            [sys.executable, "-c", DIGEST], env=environment, capture_output=True, check=True
+        )
+        digests.add(done.stdout)
+    assert len(digests) == 1
+
+
+@pytest.mark.parametrize("bug", FOUND)
+def test_a_planted_bug_is_found_at_once(bug: str) -> None:
+    assert found_by(bug, FOUND[bug], seeds=1) == 0
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("bug", FOUND_LATER)
+def test_every_planted_bug_is_found(bug: str) -> None:
+    assert found_by(bug, FOUND_LATER[bug], MOST_SEEDS) is not None
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("bug", IN_SUM)
+def test_fusion_that_is_too_certain_shows_in_the_sum_of_histories(bug: str) -> None:
+    with planted(bug):
+        found = summed([run_seed(seed, 60.0) for seed in POOLED])
+    assert found.blind_nees > found.blind_nees_bound
+    assert found.has_failed
+
+
+def test_every_planted_bug_has_an_invariant() -> None:
+    assert {*FOUND, *FOUND_LATER, *IN_SUM} == {*BUGS}
+
+
+@pytest.mark.long
+def test_a_failing_history_shrinks_and_fails_again_from_its_file(tmp_path: Path) -> None:
+    history, file = history_of(0), tmp_path / "luck-0.json"
+    with planted("double count"):
+        shrunk = shrink(history, fails_like("used once"))
+        file.write_bytes(history_text(shrunk))
+        broken = run_history(read_history(file), stop_early=True).violations
+    assert len(shrunk.events) <= MOST_EVENTS
+    assert len(shrunk.sentences()) == 1 + len(shrunk.events)
+    assert broken[0].invariant == "used once"
+    assert run_history(shrunk).violations == ()
+
+
+def test_a_file_that_is_no_history_is_refused(tmp_path: Path) -> None:
+    file = tmp_path / "other.json"
+    file.write_text('{"seed": "x"}')
+    with pytest.raises(InputError, match="not a history"):
+        read_history(file)
