@@ -12,6 +12,7 @@ from cpcbl_transport.messages import Refusal
 
 GOOD_M = 0.15  # the demonstration has 0.03 m; the blind scout without help 0.1 m after some seconds
 REJOIN_S = 5.0  # after a fault has healed; less what the machine lengthens gaps by
+FOUND_S = 8.0  # after a robot was carried away, as all are when a new world starts
 LATE_S = 1.0  # later than any track should come
 LEAST_KIDNAPPING_M = 2.0  # how far its round has taken it by then depends on the machine
 FINDERS = 2  # of three that drive; one may be out of the liar's sight for long
@@ -43,10 +44,12 @@ def checks_unaffected(
     ]
 
 
-def check_back(run: FaultRun, what: str, after_s: float | None, from_s: float) -> Check:
+def check_back(
+    run: FaultRun, what: str, after_s: float | None, from_s: float, most_s: float = REJOIN_S
+) -> Check:
     """From the end of a fault until something was as before it, less what the machine adds."""
     late_s = 0.0 if after_s is None else run.log.machine.late_s(from_s, from_s + after_s)
-    return at_most(what, after_s, REJOIN_S, "s", late_s)
+    return at_most(what, after_s, most_s, "s", late_s)
 
 
 def check_gap(
@@ -168,12 +171,11 @@ def all_found_after_s(run: FaultRun) -> float | None:
 
 def kill_field(run: FaultRun) -> list[Check]:
     """The robots continue without inputs, and localize themselves in the new world."""
+    found_s = all_found_after_s(run)
     return [
         check_gap(run.log, run.robots, *run.window_s, "longest gap between tracks", 1.5),
         at_most("a new field started after", run.restarted_s - run.fault_s, 10.0, "s"),
-        check_back(
-            run, "from then until all were localized", all_found_after_s(run), run.restarted_s
-        ),
+        check_back(run, "from then until all were localized", found_s, run.restarted_s, FOUND_S),
         *checks_recovered(run, run.healed_s),
     ]
 
@@ -306,9 +308,9 @@ def kidnap(run: FaultRun) -> list[Check]:
     return [
         at_least("distance of the kidnapping", moved_m, LEAST_KIDNAPPING_M, "m"),
         at_most("it reported that it was lost after", lost_s, 3.0, "s"),
-        at_most("it was localized after", log.localized_after_s(robot, at_s), 8.0, "s"),
+        at_most("it was localized after", log.localized_after_s(robot, at_s), FOUND_S, "s"),
         *checks_unaffected(log, run.others, at_s, run.end_s),
-        *checks_recovered(run, at_s + 8.0),
+        *checks_recovered(run, at_s + FOUND_S),
         at_least("robots that trust all others at the end", len(believed), len(run.robots)),
     ]
 
