@@ -22,6 +22,7 @@ from benchmarks.report import show_and_write, user_errors
 from msgspec import Struct
 from msgspec.structs import replace
 from rich.console import RenderableType
+from support.simulated import SteppableProxy
 
 from cpcbl_agents.node import Steppable
 from cpcbl_launch.reporting.recorder import Recorder
@@ -190,24 +191,16 @@ def measure_team(
     )
 
 
-class TimedNode:
+class TimedNode(SteppableProxy):
     """A node, and the CPU time that its steps took."""
 
     def __init__(self, node: Steppable) -> None:
-        self._node = node
+        super().__init__(node)
         self.cpu_s = 0.0
-
-    @property
-    def next_ns(self) -> int:
-        return self._node.next_ns
-
-    @property
-    def waiting(self) -> bool:
-        return self._node.waiting
 
     def step(self, now_ns: int) -> None:
         began_s = time.process_time()
-        self._node.step(now_ns)
+        super().step(now_ns)
         self.cpu_s += time.process_time() - began_s
 
 

@@ -33,6 +33,7 @@ from cpcbl_transport.decoding import Received, Subscriber
 from cpcbl_transport.memory_bus import MemoryHub
 from cpcbl_transport.messages import Drive, encode
 from cpcbl_transport.topics import Qos
+from support.simulated import SteppableProxy
 
 Drives = Mapping[str, tuple[Drive, ...]]
 HELP = ("fix/", "belief/")
@@ -171,23 +172,16 @@ class _DelayingBus(BusProxy):
         return _DelayingPublisher(found, self._delays) if key.startswith(HELP) else found
 
 
-class _Timed(Steppable):
+class _Timed(SteppableProxy):
     """A node that tells the delays what time it is."""
 
     def __init__(self, node: Node, delays: _Delays) -> None:
-        self._node, self._delays = node, delays
-
-    @property
-    def next_ns(self) -> int:
-        return self._node.next_ns
-
-    @property
-    def waiting(self) -> bool:
-        return self._node.waiting
+        super().__init__(node)
+        self._delays = delays
 
     def step(self, now_ns: int) -> None:
         self._delays.now_ns = now_ns
-        self._node.step(now_ns)
+        super().step(now_ns)
 
 
 # Forty pairs --------------------------------------------------------------------------------------

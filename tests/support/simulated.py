@@ -29,6 +29,24 @@ from cpcbl_transport.bus import Bus
 from cpcbl_transport.memory_bus import MemoryHub
 
 
+class SteppableProxy(Steppable):
+    """Stands before a node and passes everything on, for those that measure or note its steps."""
+
+    def __init__(self, node: Steppable) -> None:
+        self._node = node
+
+    @property
+    def next_ns(self) -> int:
+        return self._node.next_ns
+
+    @property
+    def waiting(self) -> bool:
+        return self._node.waiting
+
+    def step(self, now_ns: int) -> None:
+        self._node.step(now_ns)
+
+
 class ScheduledGuest(NamedTuple):
     """A guest, and when it is there (seconds of robot time)."""
 

@@ -168,20 +168,20 @@ class _RecordedArrivals(Arrivals):
         return token
 
     def take_message(self) -> tuple[str, bytes]:
-        message = self._inbox.take()
+        message = super().take_message()
         self._recorder.note(MessageTaken(*message), len(message[1]))
         return message
 
     def take_frame(self) -> tuple[str, bytes] | None:
-        if not self._frames:
+        frame = super().take_frame()
+        if frame is None:
             return None
-        frame = self._frames.popleft()
         payload = self._recorder.without_image(*frame)[: LARGEST_FRAME + 1]
         self._recorder.note(FrameTaken(frame[0], payload), len(payload))
         return frame
 
     def note_taken(self, taken: int, waiting: int) -> None:
-        self._inbox.is_fair = taken < waiting
+        super().note_taken(taken, waiting)
         if taken < waiting:
             self._recorder.note_waiting(waiting)
 

@@ -16,8 +16,7 @@ from cpcbl_agents.flight_recorder.entries import (
     Polled,
     Put,
 )
-from cpcbl_agents.flight_recorder.segments import SUFFIX
-from cpcbl_launch.recordings.read import BUS, Process, read_run
+from cpcbl_launch.recordings.read import BUS, Process, read_run, recorded_files
 from cpcbl_launch.reporting.recorded_file import Recorded, RecordedFile
 from cpcbl_team.config import Team
 from cpcbl_team.inputs import Odometry, Position, Sightings
@@ -46,7 +45,7 @@ def is_recording(path: Path) -> bool:
     """Whether this is a recorded run, or is meant to be one."""
     if not path.is_dir():
         return path.suffix == ".mcap"
-    return any(path.glob("*.mcap")) or any(path.glob(f"*/*{SUFFIX}"))
+    return any(path.glob("*.mcap")) or bool(recorded_files(path))
 
 
 def gather(run: Path, is_wanted: Callable[[str], bool] = lambda key: True) -> Gathered:
@@ -54,20 +53,20 @@ def gather(run: Path, is_wanted: Callable[[str], bool] = lambda key: True) -> Ga
     LogError, TeamFileError."""
     if not run.is_dir():
         return _of_file(run, is_wanted)
-    bus = run / BUS
-    if not any(run.glob(f"*/*{SUFFIX}")):
-        for path in (bus, run / MERGED):
+    if not recorded_files(run):
+        for path in (run / BUS, run / MERGED):
             if path.is_file():
                 return _of_file(path, is_wanted)
     found = read_run(run)
     remarks = list(found.damage)
     processes = [process for of_robot in found.processes.values() for process in of_robot]
     sources: list[Iterator[Recorded]] = []
-    if bus.is_file():
-        heard = _of_file(bus, is_wanted)
+    if found.bus is not None:
+        heard = _of_file(found.bus, is_wanted)
         remarks += heard.remarks
         sources.append(heard.messages)
-    sources += [_of_process(process, remarks, has_looks=bus.is_file()) for process in processes]
+    has_looks = found.bus is not None
+    sources += [_of_process(process, remarks, has_looks) for process in processes]
     first = processes[0]
     wanted = (recorded for recorded in _merged(sources) if is_wanted(recorded.key))
     return Gathered(first.team, first.header.version, wanted, remarks)

@@ -18,10 +18,9 @@ from google.protobuf.message import Message as Protobuf
 from mcap.writer import Writer
 from mcap_protobuf.schema import register_schema
 
-from cpcbl_agents.flight_recorder.segments import SUFFIX
 from cpcbl_launch.recordings.foxglove import FoxgloveRun
 from cpcbl_launch.recordings.gather import MERGED, gather, is_recording
-from cpcbl_launch.recordings.read import BUS
+from cpcbl_launch.recordings.read import BUS, recorded_files
 from cpcbl_launch.reporting.recorded_file import ABOUT, Recorded, RecordedFile
 from cpcbl_launch.reporting.recording import TEAM
 from cpcbl_team.config import Team
@@ -182,6 +181,6 @@ def _merged_file(run: Path) -> Path | None:
     merged = run / MERGED
     if not merged.is_file():
         return None
-    parts = [part for part in (*run.glob(f"*/*{SUFFIX}"), run / BUS) if part.is_file()]
+    parts = [part for part in (*recorded_files(run), run / BUS) if part.is_file()]
     made_ns = merged.stat().st_mtime_ns
     return merged if all(part.stat().st_mtime_ns <= made_ns for part in parts) else None

@@ -92,6 +92,11 @@ class Run(NamedTuple):
         return path if path.is_file() else None
 
 
+def recorded_files(folder: Path) -> list[Path]:
+    """The files that robots wrote into the folder of a run."""
+    return sorted(folder.glob(f"*/*{SUFFIX}"))
+
+
 def read_run(folder: Path) -> Run:
     """The run in a folder. Raises LogError for a folder without a single file of a robot that can
     be read."""
@@ -99,7 +104,7 @@ def read_run(folder: Path) -> Run:
         raise LogError(f"{folder}: no folder of a run; `up --record FOLDER` makes one")
     segments: dict[tuple[str, str], list[Segment]] = {}
     damage: list[str] = []
-    for path in sorted(folder.glob(f"*/*{SUFFIX}")):
+    for path in recorded_files(folder):
         try:
             with path.open("rb") as file:
                 header = read_header(file)

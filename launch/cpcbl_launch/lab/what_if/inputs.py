@@ -14,7 +14,7 @@ from cpcbl_agents.flight_recorder.entries import Detected, FrameTaken, MessageTa
 from cpcbl_agents.node import NodeStart
 from cpcbl_agents.sources.mrclam import MrclamSource
 from cpcbl_launch.recordings.gather import gather
-from cpcbl_launch.recordings.read import Process, read_run
+from cpcbl_launch.recordings.read import Process, read_run, recorded_files
 from cpcbl_launch.recordings.summary import summarize
 from cpcbl_launch.reporting.metrics import Floats, Trajectory
 from cpcbl_launch.reporting.recorder import Report
@@ -101,7 +101,7 @@ class RecordedInputs(NamedTuple):
 def read_inputs(path: Path) -> RecordedInputs:
     """The inputs in the folder of a run, or in a recording of the bus. Raises LogError,
     TeamFileError, and InputError where the robots' inputs are not in it."""
-    if path.is_dir() and any(path.glob("*/*.cpcbl")):
+    if path.is_dir() and recorded_files(path):
         run = read_run(path)
         damage: list[str] = []
         every = [process for of_robot in run.processes.values() for process in of_robot]
