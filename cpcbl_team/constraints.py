@@ -87,7 +87,9 @@ class Constraint(NamedTuple):
     sigma: float  # of the sensor, in the residual's unit
     distance_m: float  # robot to object; non-probabilistic weights are its inverse
     on_heading: bool
-    place_row: tuple[float, float]  # how the residual follows an error in the object's position
+    place_row: tuple[float, float]
+    """By how much the residual falls with the error of the object's place: of x and y (m), or of a
+    wall's offset along its normal (m) and its direction (rad)."""
 
     @property
     def is_bearing(self) -> bool:
@@ -167,7 +169,8 @@ def wall_line(
     side = 1.0 if offset >= 0.0 else -1.0
     u, v = side * nx, side * ny
     weighed = max(distance_m, NEAREST_M)
-    return Constraint((u, v, 0.0), distance_m - abs(offset), sigma_m, weighed, False, (u, v))
+    of_place = side, v * (pose.x - x) - u * (pose.y - y)
+    return Constraint((u, v, 0.0), distance_m - abs(offset), sigma_m, weighed, False, of_place)
 
 
 def wall_heading(
@@ -179,4 +182,4 @@ def wall_heading(
     towards = wall_direction - math.copysign(0.5 * math.pi, offset)
     residual = wrap_angle(towards - bearing - pose.heading)
     weighed = max(abs(offset), NEAREST_M)
-    return Constraint((0.0, 0.0, 1.0), residual, sigma, weighed, True, (0.0, 0.0))
+    return Constraint((0.0, 0.0, 1.0), residual, sigma, weighed, True, (0.0, 1.0))

@@ -114,7 +114,8 @@ class Landmarks:
         )
         self._marks: dict[str, Mark] = {}
         if plain:
-            self._marks = {n: Mark(p.x_m, p.y_m, p.gives) for n, p in field.landmarks.items()}
+            exact = {name: mark for name, mark in field.landmarks.items() if mark.is_exact}
+            self._marks = {name: Mark(p.x_m, p.y_m, p.gives) for name, p in exact.items()}
         self._uses_rays = rules.bearing_for_position
         self._gates = gates
         self._share_squared = s.range_share**2

@@ -7,7 +7,7 @@ import math
 from collections.abc import Iterable
 from typing import Final
 
-from cpcbl_team.camera_filter import CameraFilter, considers_camera
+from cpcbl_team.common_error_filter import common_error_filter
 from cpcbl_team.common_errors import CommonErrors
 from cpcbl_team.config import CameraSettings, Field, LocalizationSettings
 from cpcbl_team.estimate import HEADING, POSE, POSITION, Estimate, Scope
@@ -90,12 +90,10 @@ class Localizer:
         self._belief_age_ns = int(settings.collaboration.max_age_s * 1e9)
         self._timers = ObjectTimers(settings)
         self._variant = variant_of(settings, field)
-        self._camera: CameraFilter | None = None
-        if camera is not None and considers_camera(settings, camera):
-            self._camera = CameraFilter(settings, camera)
-        self._landmarks = Landmarks(field, settings, gates, self._camera is not None)
+        self._common = common_error_filter(settings, field, camera)
+        self._landmarks = Landmarks(field, settings, gates, self._common is not None)
         self._calibration = OwnCalibration(settings, field, self._landmarks)
-        parts = self._variant, self._calibration, self._camera
+        parts = self._variant, self._calibration, self._common
         self._prediction = Prediction(settings, *parts)
         self.recovery = Recovery(settings, field, self._landmarks, self._variant.reduce)
         self.screen = TeammateScreen(settings, gates, self._variant.is_probabilistic, team)
@@ -115,10 +113,10 @@ class Localizer:
             gated = self.constrain(state.estimate, others, scope, state.common_errors)
         if self.screen.has_recent_reports(state, now):  # beyond the paper: trust
             state, gated = self.screen.screen_frame(state, landmarks, gated)
-        if self._camera is None:
+        if self._common is None:
             estimate = self.correct(state.estimate, landmarks, gated, scope)
         else:
-            state, estimate = self._camera.correct(state, gated.accepted)
+            state, estimate = self._common.correct(state, gated.accepted)
         return self.recovery.check(self._with_frame(state, estimate, landmarks, gated, scope))
 
     # Step 1 -----------------------------------------------------------------------------------
@@ -152,7 +150,7 @@ class Localizer:
             measured: list[Measurement] = []
             faults: list[str] = []
             if landmarks.others:
-                measured, faults = self._measure_others(state, landmarks.others, now)
+                state, measured, faults = self._measure_others(state, landmarks.others, now)
             usable = self._timers.usable(updates, measured, now) if measured else measured
             if landmarks.constrains or any(constrains(m, scope, self._rules) for m in usable):
                 break
@@ -163,9 +161,9 @@ class Localizer:
             snapshot = new(LandmarkSnapshot, fields)
             state = with_recovery(state, with_snapshot(recovery, snapshot))
         if measured or faults:
-            evidence, camera = measured, self._camera
-            if camera is not None:
-                evidence = [camera.as_evidence(state, m) for m in measured]
+            evidence, common = measured, self._common
+            if common is not None:
+                evidence = [common.as_evidence(state, m) for m in measured]
             state = with_recovery(state, with_measurements(state, evidence)).counted(*faults)
         return state, scope, landmarks, usable
 
@@ -187,8 +185,9 @@ class Localizer:
 
     def _measure_others(
         self, state: State, sightings: Iterable[Sighting], now_ns: int
-    ) -> tuple[list[Measurement], list[str]]:
-        """The usable ones of these sightings, and the faults of those that have one."""
+    ) -> tuple[State, list[Measurement], list[str]]:
+        """The state that estimates the places of what is seen, the usable ones of these sightings,
+        and the faults of those that have one."""
         beliefs, pose = state.memory.teammates.beliefs, state.estimate.pose
         measured: list[Measurement] = []
         faults: list[str] = []
@@ -200,13 +199,16 @@ class Localizer:
             if fault:
                 faults.append(fault)
                 continue
-            if self._camera is not None:
-                sighting = self._camera.corrected(state, sighting)
-            m = measurement_of(sighting, now_ns, pose, self.field, beliefs, self.settings)
+            if self._common is not None:
+                state = self._common.with_object(state, sighting.id)
+                sighting = self._common.corrected(state, sighting)
+            m = measurement_of(
+                sighting, now_ns, pose, self.field, beliefs, self.settings, state.common_errors
+            )
             if m is not None:
                 m = m.corrected(bias, adaptation.ranges) if is_wrong else m
                 measured.append(m if factor == 1.0 else m.inflated(factor))
-        return measured, faults
+        return state, measured, faults
 
     # Steps 3 to 5 -----------------------------------------------------------------------------
 
@@ -222,7 +224,7 @@ class Localizer:
         gated = GatedObjects([], [])
         for m in sorted(measurements, key=_source):
             constraints = constraints_of(prior.pose, m, scope, self._rules)
-            if self._widens and not m.is_teammate:
+            if self._widens and not m.is_dependent:
                 constraints = curved(prior, m, constraints)
             if constraints:
                 found = gated_object(prior, m, constraints, common)
@@ -301,8 +303,8 @@ class Localizer:
         if nis > self._gates[1]:
             return self.recovery.check(self._with_update(state, prior, None, {}, 1))
         by_teammate = observation.observer is not None
-        if self._camera is not None:
-            state, estimate = self._camera.observed(state, prior, position, by_teammate)
+        if self._common is not None:
+            state, estimate = self._common.observed(state, prior, position, by_teammate)
         else:
             estimate = self._variant.correct_position(prior, position, by_teammate)
         return self._observe_heading(state, estimate, observation)
@@ -315,8 +317,8 @@ class Localizer:
         heading = observation.of_heading(estimate.pose)
         if heading is not None:
             if heading.normalized_innovation_squared(estimate.covariance) <= self._gates[0]:
-                if self._camera is not None:
-                    state, estimate = self._camera.observed(state, estimate, heading, True)
+                if self._common is not None:
+                    state, estimate = self._common.observed(state, estimate, heading, True)
                 else:
                     estimate = self._variant.correct_heading(estimate, heading)
             else:
@@ -356,7 +358,7 @@ class Localizer:
         """What the robot changed in its settings because of wrong inputs is as configured again."""
         state = self._calibration.without_adaptation(self.predict(state, event.stamp_ns))
         state = with_mended_inputs(state, event)
-        return state if self._camera is None else self._camera.started(state)
+        return state if self._common is None else self._common.started(state)
 
     # The start --------------------------------------------------------------------------------
 
@@ -368,7 +370,7 @@ class Localizer:
     def start(self, stamp_ns: int) -> State:
         """The state at the start: at the configured pose, or lost somewhere on the field."""
         state = state_at_start(stamp_ns, self.settings.start, self.field)
-        return state if self._camera is None else self._camera.started(state)
+        return state if self._common is None else self._common.started(state)
 
 
 def _source(m: Measurement) -> str:

@@ -3,14 +3,12 @@ and their evidence."""
 
 import math
 from collections.abc import Iterable, Mapping
-from functools import lru_cache
 from typing import NamedTuple
 
 import msgspec
 
 from cpcbl_team import config
-from cpcbl_team.camera_errors import bearing_sensitivity, range_sensitivity
-from cpcbl_team.common_errors import CommonErrors, Pair
+from cpcbl_team.common_errors import CommonErrors
 from cpcbl_team.constraints import (
     CURVED_SHARE,
     Constraint,
@@ -36,24 +34,17 @@ from cpcbl_team.fusion import Observation, chi_square
 from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.geometry import Pose2, step, wrap_angle
 from cpcbl_team.inputs import Belief, HeadingBelief, Sighting
+from cpcbl_team.parameters import Sensitivity
+from cpcbl_team.places import EXACT, ObjectPosition, map_object
 from cpcbl_team.range_errors import RangeErrors
 from cpcbl_team.sensors import sighting_sigmas
 
-_EXACT = Covariance2(0.0, 0.0, 0.0)
 BELIEF_VALID_BEFORE_NS = 500_000_000
 """A belief is also used for sightings of up to this time before it: a robot subscribes to a
 teammate's beliefs when it sees it, and what it saw before the first one came must not be lost."""
 
 
 # Where a teammate is: one whose belief was received is one more landmark --------------------------
-
-
-class ObjectPosition(NamedTuple):
-    """The position of an object in the field's frame (m), and its covariance (m^2)."""
-
-    x: float
-    y: float
-    covariance: Covariance2
 
 
 def extrapolated(belief: Belief, at_ns: int) -> Pose2:
@@ -103,6 +94,14 @@ class Measurement(msgspec.Struct, frozen=True, gc=False):
     bearing_sigma: float
     is_for_heading: bool = False
     """Whether it may change the heading alone; it has no range then."""
+    is_estimated: bool = False
+    """Whether the robot estimates the object's place with its own pose."""
+
+    @property
+    def is_dependent(self) -> bool:
+        """Whether its object's place has an error that the estimate may contain already, and that
+        is not kept beside it."""
+        return self.is_teammate or (not self.is_estimated and any(self.position.covariance))
 
     @property
     def has_reading(self) -> bool:
@@ -136,9 +135,9 @@ class GatedObject(NamedTuple):
     constraints: list[Constraint]
     nis: float
     observation: Observation | None = None
-    """Of a teammate: the constraints as one observation of the prior."""
-    sensitivities: tuple[Pair, ...] = ()
-    """How the residuals follow the common errors of the camera, where they are considered."""
+    """Of a dependent one (see `Measurement`): the constraints as one observation of the prior."""
+    sensitivities: tuple[Sensitivity, ...] = ()
+    """How the residuals follow the common errors, where they are considered."""
 
 
 class GatedObjects(NamedTuple):
@@ -155,15 +154,13 @@ def measurement_of(
     field: config.Field,
     teammates: Mapping[str, tuple[Belief, ...]],
     settings: config.LocalizationSettings,
+    common: CommonErrors | None = None,
 ) -> Measurement | None:
     """The sighting, from about `pose`, with its object's position; None if that is not known."""
-    name, is_for_heading = sighting.id, False
-    wall, landmark, gives = field.walls.get(name), field.landmarks.get(name), "both"
-    if landmark is not None:
-        position = _on_map(landmark.x_m, landmark.y_m)
-        gives = landmark.gives
-    elif wall is not None:
-        position, gives = _on_map(*wall.from_m), wall.gives
+    name, is_for_heading, wall, gives = sighting.id, False, None, "both"
+    on_map = map_object(field, name, common)
+    if on_map is not None:
+        position, wall, gives = on_map
     elif name in teammates and settings.collaboration.passive:
         nearest = nearest_belief(teammates[name], stamp_ns, settings.collaboration)
         if nearest is None:
@@ -180,14 +177,9 @@ def measurement_of(
     if gives == "range" or gives == "none":
         bearing = None
     sigmas = sighting_sigmas(sighting, sensor, _expected_range(pose, position, wall))
-    is_teammate = landmark is None and wall is None
     read = range_m, bearing, *sigmas
-    return Measurement(name, position, wall, is_teammate, *read, is_for_heading)
-
-
-@lru_cache(1024)
-def _on_map(x: float, y: float) -> ObjectPosition:
-    return ObjectPosition(x, y, _EXACT)
+    is_estimated = common is not None and name in common.objects
+    return Measurement(name, position, wall, on_map is None, *read, is_for_heading, is_estimated)
 
 
 def _expected_range(pose: Pose2, position: ObjectPosition, wall: config.Wall | None) -> float:
@@ -261,11 +253,11 @@ def curved(prior: Estimate, m: Measurement, cs: list[Constraint]) -> list[Constr
 
 def combine(evidence: Information, accepted: Iterable[GatedObject]) -> Information:
     """Step 4: the Gaussians at the closest points of all constraints on the map's objects, as one
-    with `evidence`."""
+    with `evidence`. Dependent ones (see `Measurement`) are merged on their own."""
     return evidence.with_all(
         (c.row, c.residual, c.sigma * c.sigma)
         for found in accepted
-        if not found.measurement.is_teammate
+        if found.observation is None
         for c in found.constraints
     )
 
@@ -275,12 +267,12 @@ def gated_object(
 ) -> GatedObject:
     """One object with the normalized innovation squared of its constraints."""
     covariance = prior.covariance
-    added = _EXACT
-    sensitivities: tuple[Pair, ...] = ()
+    added = EXACT
+    sensitivities: tuple[Sensitivity, ...] = ()
     if common is not None:
         sensitivities = sensitivities_of(m, cs, common)
         added = common.innovation(tuple(c.row for c in cs), sensitivities)
-    if m.is_teammate:
+    if m.is_dependent:
         observation = observation_of(prior, m, cs)
         if common is not None:
             observation = observation._replace(dependent=observation.dependent + added)
@@ -301,24 +293,19 @@ def gated_object(
 
 def sensitivities_of(
     m: Measurement, cs: list[Constraint], common: CommonErrors
-) -> tuple[Pair, ...]:
-    """How the residuals of constraints follow the errors of the camera."""
-    off_axis = 0.0 if m.bearing is None else m.bearing - common.axis_rad
-    pairs = []
-    for c in cs:
-        if c.is_bearing:  # its residual falls when the bearing grows
-            yaw, focal = bearing_sensitivity(off_axis)
-            pairs.append((-c.row[2] * yaw, -c.row[2] * focal))
-        else:
-            pairs.append(range_sensitivity(m.range_m or 0.0, off_axis))
-    return tuple(pairs)
+) -> tuple[Sensitivity, ...]:
+    """How the residuals of constraints follow the common errors."""
+    return tuple(
+        common.sensitivity(m.source, c.place_row, c.is_bearing, c.row[2], m.range_m, m.bearing)
+        for c in cs
+    )
 
 
 def observation_of(prior: Estimate, m: Measurement, cs: list[Constraint]) -> Observation:
     """The constraints of one object as an observation of the prior, at which they are linearized.
 
-    A teammate's pose covariance is compounded with the sensor's (checklist row 39), as the
-    dependent part.
+    The covariance of the object's place, as a teammate's (checklist row 39), is compounded with the
+    sensor's as the dependent part.
     """
     rows, residuals = tuple(c.row for c in cs), tuple(c.residual for c in cs)
     sensor = [c.sigma * c.sigma for c in cs]

@@ -1,6 +1,6 @@
 """Step 1 of the cycle: the state at a later time, by odometry."""
 
-from cpcbl_team.camera_filter import CameraFilter
+from cpcbl_team.common_error_filter import CommonErrorFilter
 from cpcbl_team.config import LocalizationSettings
 from cpcbl_team.geometry import step
 from cpcbl_team.inputs import Odometry
@@ -20,13 +20,13 @@ class Prediction:
         settings: LocalizationSettings,
         variant: JointVariant,
         calibration: OwnCalibration,
-        camera: CameraFilter | None,
+        common: CommonErrorFilter | None,
     ) -> None:
-        """`camera`: the one whose errors depend on those of the pose."""
+        """`common`: the errors that depend on those of the pose."""
         self._odometry, self._moves = settings.odometry, settings.odometry.moves
         self._odometry_timeout_ns = int(settings.odometry.timeout_s * 1e9)
         self._has_dead_zone = settings.odometry.least_speed_m_s > 0.0
-        self._variant, self._calibration, self._camera = variant, calibration, camera
+        self._variant, self._calibration, self._common = variant, calibration, common
 
     def add_odometry(self, state: State, odometry: Odometry) -> State:
         """Takes the next piece of odometry; predictions for later times will use it."""
@@ -64,8 +64,8 @@ class Prediction:
             if own.is_known(state):
                 state, distance, turn = own.corrected_motion(state, distance, turn)
                 extra = own.extra_variance(state, distance, turn, crawl_s)
-            if self._camera is not None:
-                state = self._camera.before_motion(state, distance, turn, seconds)
+            if self._common is not None:
+                state = self._common.before_motion(state, distance, turn, seconds)
             if distance != 0.0 or turn != 0.0:
                 odometry_from_robot = step(odometry_from_robot, distance, turn)
                 estimate = self._variant.move(estimate, distance, turn, crawl_s, extra)
@@ -83,8 +83,8 @@ class Prediction:
         if self._calibration.is_known(state):
             state, distance, turn = self._calibration.corrected_motion(state, distance, turn)
         if distance != 0.0 or turn != 0.0 or extra != NO_VARIANCE:
-            if self._camera is not None:
-                state = self._camera.before_motion(state, distance, turn, 0.0)
+            if self._common is not None:
+                state = self._common.before_motion(state, distance, turn, 0.0)
             place = step(place, distance, turn)
             estimate = self._variant.move(estimate, distance, turn, 0.0, extra)
         silent_ns = min(gap_ns - self._odometry_timeout_ns, until_ns - from_ns)

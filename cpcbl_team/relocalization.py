@@ -8,6 +8,7 @@ errs between two pieces is in all that are older.
 """
 
 import math
+from collections import Counter
 from collections.abc import Iterator
 from typing import NamedTuple
 
@@ -66,7 +67,11 @@ def relocalize(
     if not headed and len({(e.x, e.y) for e in evidence}) < 2:
         return None
     repeated = sum(e.from_teammate for e in evidence) + headed
-    pieces = [PropagatedEvidence(e, odometry_from_robot, repeated) for e in evidence]
+    uses = Counter(e.source for e in evidence if e.source in field.landmarks)
+    pieces = [
+        PropagatedEvidence(e, odometry_from_robot, repeated if e.from_teammate else uses[e.source])
+        for e in evidence
+    ]
     if sum(readings_of(e) for e in evidence) < 4:
         return None
     fits = [_fit(start, pieces) for start in _spread_starts(pieces, field)]
@@ -104,12 +109,12 @@ class PropagatedEvidence:
     """A piece of evidence that dead reckoning has brought to the present."""
 
     def __init__(self, evidence: Evidence, odometry_from_robot: Pose2, repeated: int) -> None:
-        """`repeated`: how many pieces may have the same error of a teammate."""
+        """`repeated`: how many pieces may have the same error of a teammate, or of a place."""
         self.evidence = evidence
         self.now_from_then = odometry_from_robot.inverse() @ evidence.odometry_from_robot
         drift_m, drift_rad = drift_sigmas(self.now_from_then)
         self.is_fix = evidence.range_m is None and evidence.bearing_rad is None
-        factor = math.sqrt(repeated) if evidence.from_teammate else 1.0
+        factor = math.sqrt(max(repeated, 1))
         self._teammate_m = factor * evidence.teammate_sigma_m
         self._teammate_rad = factor * evidence.teammate_sigma_rad
         self.sigma_m = math.hypot(self._teammate_m, drift_m)

@@ -6,6 +6,7 @@ before, the covariance is inflated.
 """
 
 from collections.abc import Collection, Iterable
+from itertools import product
 
 from msgspec.structs import replace
 
@@ -238,24 +239,23 @@ def _own_offset(state: State, sums: Information, accepted: Iterable[GatedObject]
     common, variance = state.common_errors, state.estimate.covariance.hh
     if common is None:
         return _evidence_at(state, sums)
-    of_yaw = of_focal = Information.none()
+    of_parameter: dict[int, Information] = {}
     for found in accepted:
         if not found.measurement.is_teammate:
-            for c, (yaw, focal) in zip(found.constraints, found.sensitivities, strict=True):
-                of_yaw = of_yaw.add(c.row, yaw, c.sigma * c.sigma)
-                of_focal = of_focal.add(c.row, focal, c.sigma * c.sigma)
+            for c, sensitivity in zip(found.constraints, found.sensitivities, strict=True):
+                for i, factor in sensitivity:
+                    before = of_parameter.get(i, Information.none())
+                    of_parameter[i] = before.add(c.row, factor, c.sigma * c.sigma)
     place, turn = 1.0 / FARTHEST_OFFSET_M**2, 1.0 / (variance + HEADING_VARIANCE)
     prior = Covariance3(place, 0.0, place, 0.0, 0.0, turn)
     inverse = sums.matrix.plus(prior).inverse()
-    (ax, ay, _), (bx, by, _) = (inverse.times(i.vector) for i in (of_yaw, of_focal))
-    yy, yf, ff = common.covariance
-    dependent = Covariance2(
-        ax * ax * yy + 2.0 * ax * bx * yf + bx * bx * ff,
-        ax * ay * yy + (ax * by + ay * bx) * yf + bx * by * ff,
-        ay * ay * yy + 2.0 * ay * by * yf + by * by * ff,
-    )
+    moved = {i: inverse.times(information.vector) for i, information in of_parameter.items()}
+    covariance, xx, xy, yy = common.parameters.covariance, 0.0, 0.0, 0.0
+    for (i, (ax, ay, _)), (j, (bx, by, _)) in product(moved.items(), repeat=2):
+        both = covariance[i][j]
+        xx, xy, yy = xx + ax * bx * both, xy + ax * by * both, yy + ay * by * both
     position = _without_heading(sums, variance)
-    return _evidence_at(state, position, dependent).weighted(INDEPENDENT_FRAMES)
+    return _evidence_at(state, position, Covariance2(xx, xy, yy)).weighted(INDEPENDENT_FRAMES)
 
 
 def _with_camera(state: State, m: Measurement, evidence: OffsetEvidence) -> OffsetEvidence:
@@ -264,7 +264,8 @@ def _with_camera(state: State, m: Measurement, evidence: OffsetEvidence) -> Offs
     common = state.common_errors
     if common is None:
         return evidence
-    (x, y, covariance), (yy, _, ff), pose = m.position, common.covariance, state.estimate.pose
+    (yy, _, ff), pose = common.camera_covariance, state.estimate.pose
+    x, y, covariance = m.position
     squared = (x - pose.x) ** 2 + (y - pose.y) ** 2
     variance = 0.5 * (covariance.xx + covariance.yy + squared * (yy + ff))
     sums = _without_heading(evidence.evidence, evidence.heading_variance)

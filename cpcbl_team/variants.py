@@ -84,7 +84,9 @@ class JointVariant:
                 if found.measurement.is_for_heading:
                     within, estimate = HEADING, with_all_shared(estimate)
                 observation = found.observation.shifted(dx, dy, turn)
-                estimate = self._merge_teammate(estimate, observation, within)
+                # The error of a place is the same at each sighting, whatever teammates send
+                merge_it = self._merge_teammate if found.measurement.is_teammate else merge_split
+                estimate = merge_it(estimate, observation, within)
         return self.reduce(estimate)
 
     def correct_position(

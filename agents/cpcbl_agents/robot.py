@@ -19,7 +19,7 @@ from cpcbl_agents.guests import GuestRegistry
 from cpcbl_agents.sensing import SensingAgent
 from cpcbl_agents.sources import OwnCamera, Source
 from cpcbl_agents.waypoint_follower import WaypointFollower
-from cpcbl_team.camera_filter import considers_camera
+from cpcbl_team.common_error_filter import considers_camera
 from cpcbl_team.config import Team
 from cpcbl_team.estimate import Estimate
 from cpcbl_team.inputs import BeliefShared, InitialPose, InputsMended, SightingFault

@@ -21,6 +21,14 @@ class Landmark(Table, frozen=True, kw_only=True):
     """Which measurements of it the robots use."""
     colours: Bands | None = None
     """The colour bands of the cylinder that stands there, by which a camera recognises it."""
+    sigma_m: NotNegative = 0.0
+    """Standard deviation of its place along each axis of the field (m); 0: it is known exactly."""
+    covariance_m2: tuple[float, float, float] | None = None
+    """In place of `sigma_m`: the covariance (xx, xy, yy) of its place in the field's frame."""
+
+    @property
+    def is_exact(self) -> bool:
+        return self.sigma_m == 0.0 and not any(self.covariance_m2 or ())
 
 
 class Wall(Table, frozen=True, kw_only=True):
@@ -29,6 +37,14 @@ class Wall(Table, frozen=True, kw_only=True):
     from_m: tuple[float, float]
     to_m: tuple[float, float]
     gives: Gives = "both"
+    sigma_m: NotNegative = 0.0
+    """Standard deviation of its middle along its normal (m)."""
+    direction_sigma_deg: NotNegative = 0.0
+    """Standard deviation of its direction."""
+
+    @property
+    def is_exact(self) -> bool:
+        return self.sigma_m == 0.0 and self.direction_sigma_deg == 0.0
 
     @property
     def direction_rad(self) -> float:
@@ -48,6 +64,17 @@ class Field(Table, frozen=True, kw_only=True):
         gives = {mark.gives for mark in self.landmarks.values()}
         gives |= {wall.gives for wall in self.walls.values()}
         return "range" in gives and not gives & {"both", "bearing"}
+
+    @property
+    def is_exact(self) -> bool:
+        """Whether all places on the map are known exactly."""
+        points = all(landmark.is_exact for landmark in self.landmarks.values())
+        return points and all(wall.is_exact for wall in self.walls.values())
+
+    def has_exact(self, name: str) -> bool:
+        """Whether the place of this object is known exactly, if it is on the map at all."""
+        mark, wall = self.landmarks.get(name), self.walls.get(name)
+        return (mark is None or mark.is_exact) and (wall is None or wall.is_exact)
 
     def bounds(self) -> tuple[float, float, float, float]:
         """(least x, least y, greatest x, greatest y) in metres of what is on the map; zeros for an

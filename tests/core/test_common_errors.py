@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
+from cpcbl_team.augmented_update import AugmentedUpdate, Reading, estimated_of
 from cpcbl_team.camera_errors import NO_ERRORS, CameraErrors, without_errors
-from cpcbl_team.camera_filter import considers_camera
-from cpcbl_team.common_errors import CommonErrors, JointUpdate, Reading
+from cpcbl_team.common_error_filter import considers_camera
+from cpcbl_team.common_errors import CommonErrors
 from cpcbl_team.config import (
     CameraSettings,
     Field,
@@ -22,10 +23,10 @@ from cpcbl_team.config import (
 )
 from cpcbl_team.estimate import Covariance3, Estimate
 from cpcbl_team.fixes import fix_for
-from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.geometry import Pose2, step, wrap_angle
 from cpcbl_team.inputs import MarkerSighting, Odometry, Sighting, Sightings
 from cpcbl_team.localizer import Localizer
+from cpcbl_team.parameters import Parameters
 from cpcbl_team.state import State
 
 STEP_NS = 100_000_000
@@ -99,6 +100,11 @@ def nees(estimate: Estimate, true: Pose2) -> float:
     return float(error @ np.linalg.solve(full(estimate.covariance), error))
 
 
+def parameters_of(p: np.ndarray) -> Parameters:
+    """Those of a covariance of the pose and of them."""
+    return Parameters(tuple(map(tuple, p[3:, 3:])), tuple(map(tuple, p[3:, :3])))
+
+
 def full(c: Covariance3) -> np.ndarray:
     return np.array([[c.xx, c.xy, c.xh], [c.xy, c.yy, c.yh], [c.xh, c.yh, c.hh]])
 
@@ -134,7 +140,7 @@ def test_the_errors_are_learnt_and_what_is_learnt_is_as_certain_as_said(
         common = state.common_errors
         assert common is not None
         left = np.array(errors) - np.array(common.errors)
-        sigmas = np.sqrt([common.covariance.xx, common.covariance.yy])
+        sigmas = np.sqrt([common.camera_covariance.xx, common.camera_covariance.yy])
         assert (np.abs(left) < 3.5 * sigmas).all()
         assert (sigmas < (math.radians(0.7), 0.01)).all()
         exact, true = run(Drive(NO_ERRORS), seed)[-1]
@@ -149,13 +155,12 @@ def test_an_update_is_that_of_an_augmented_kalman_filter() -> None:
     root = random.normal(size=(5, 5))
     p = root @ root.T
     cov = Covariance3(p[0, 0], p[0, 1], p[1, 1], p[0, 2], p[1, 2], p[2, 2])
-    joint = Covariance2(p[3, 3], p[3, 4], p[4, 4])
-    common = CommonErrors(0.0, NO_ERRORS, joint, tuple(p[:3, 3]), tuple(p[:3, 4]))
+    common = CommonErrors(0.0, (0.0, 0.0), parameters_of(p))
     x = np.zeros(5)
-    update = JointUpdate(cov, common, learns=True)
+    update = AugmentedUpdate(cov, common, estimated_of(common, with_camera=True))
     for _ in range(3):
         h, residual, variance = random.normal(size=5), float(random.normal()), 0.3
-        update.add(Reading(tuple(h[:3]), tuple(h[3:]), residual, variance))
+        update.add(Reading(tuple(h[:3]), tuple(enumerate(h[3:])), residual, variance))
         total = h @ p @ h + variance
         x = x + p @ h * (residual - h @ x) / total
         p = p - np.outer(p @ h, h @ p) / total
@@ -163,8 +168,8 @@ def test_an_update_is_that_of_an_augmented_kalman_filter() -> None:
     assert estimate.pose == pytest.approx((x[0], x[1], wrap_angle(x[2])))
     assert full(estimate.covariance) == pytest.approx(p[:3, :3])
     assert common.errors == pytest.approx(x[3:])
-    assert common.covariance == pytest.approx((p[3, 3], p[3, 4], p[4, 4]))
-    assert [*common.of_yaw, *common.of_focal] == pytest.approx([*p[:3, 3], *p[:3, 4]])
+    assert common.camera_covariance == pytest.approx((p[3, 3], p[3, 4], p[4, 4]))
+    assert np.array(common.parameters.with_pose) == pytest.approx(p[3:, :3])
 
 
 @pytest.mark.parametrize("by_markers", [False, True])
@@ -174,8 +179,7 @@ def test_a_fix_is_as_uncertain_as_the_camera_makes_it(by_markers: bool) -> None:
     root = random.normal(size=(5, 5)) * np.array([0.05, 0.05, 0.03, 0.03, 0.02])[:, None]
     p = root @ root.T
     cov = Covariance3(p[0, 0], p[0, 1], p[1, 1], p[0, 2], p[1, 2], p[2, 2])
-    joint = Covariance2(p[3, 3], p[3, 4], p[4, 4])
-    common = CommonErrors(0.4, NO_ERRORS, joint, tuple(p[:3, 3]), tuple(p[:3, 4]))
+    common = CommonErrors(0.4, (0.0, 0.0), parameters_of(p))
     pose, numbers = Pose2(1.0, 2.0, 0.7), ("mate", 3.0, 0.9, 0.001, 0.001, 0.2, 0.01)
     read = MarkerSighting(*numbers, -0.6) if by_markers else Sighting(*numbers)
 
@@ -221,7 +225,7 @@ def test_the_trusted_pose_is_kept_without_covariances_with_another_pose() -> Non
     localizer, random = localizer_of(drive), np.random.default_rng(1)
     common = state.common_errors
     assert common is not None
-    assert any(common.of_yaw)
+    assert any(common.parameters.with_pose[0])
     for _ in range(30):  # it stands, and its driver turns bearings
         now_ns = state.stamp_ns + STEP_NS
         state = localizer.add_odometry(state, Odometry(state.stamp_ns, now_ns, 0.0, 0.0))
@@ -234,4 +238,4 @@ def test_the_trusted_pose_is_kept_without_covariances_with_another_pose() -> Non
     assert state.memory.recovery.mistake
     common = state.common_errors
     assert common is not None
-    assert not any((*common.of_yaw, *common.of_focal))
+    assert not any(map(any, common.parameters.with_pose))

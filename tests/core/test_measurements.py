@@ -23,12 +23,12 @@ from cpcbl_team.geometry import Pose2
 from cpcbl_team.inputs import Belief, Sighting
 from cpcbl_team.measurements import (
     Measurement,
-    ObjectPosition,
     constraints_of,
     gated_object,
     measurement_of,
     observation_of,
 )
+from cpcbl_team.places import ObjectPosition
 
 HERE = Pose2(0.0, 0.0, 0.0)
 

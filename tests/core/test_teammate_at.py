@@ -16,7 +16,8 @@ from support.core import (
 
 from cpcbl_team.config import CollaborationSettings
 from cpcbl_team.inputs import Belief
-from cpcbl_team.measurements import ObjectPosition, nearest_belief, position_by_belief
+from cpcbl_team.measurements import nearest_belief, position_by_belief
+from cpcbl_team.places import ObjectPosition
 
 RULES = CollaborationSettings(tier_width=2.0, tier_hysteresis=1.2)
 

@@ -36,8 +36,9 @@ from cpcbl_team.estimate import (
 from cpcbl_team.fusion import Observation, _merge_with_weight, chi_square_bounds
 from cpcbl_team.geometry import Pose2
 from cpcbl_team.inputs import Odometry
-from cpcbl_team.measurements import Measurement, ObjectPosition, observation_of
+from cpcbl_team.measurements import Measurement, observation_of
 from cpcbl_team.motion import bridge, inflate_by_gap
+from cpcbl_team.places import ObjectPosition
 from cpcbl_team.relocalization import PropagatedEvidence, chi_square_bound, relocalize
 from cpcbl_team.state import Evidence
 

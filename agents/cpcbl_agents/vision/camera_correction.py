@@ -7,7 +7,7 @@ import msgspec
 
 from cpcbl_agents.vision.camera_check import CameraCheck, Estimated
 from cpcbl_team.camera_errors import NO_ERRORS, CameraErrors, without_errors
-from cpcbl_team.camera_filter import considers_camera
+from cpcbl_team.common_error_filter import considers_camera
 from cpcbl_team.config import RobotSettings, Team
 from cpcbl_team.estimate import Estimate
 from cpcbl_team.geometry import Pose2, step

@@ -9,7 +9,10 @@ from collections.abc import Iterable
 from functools import partial
 from itertools import product
 
+from msgspec.structs import replace
+
 from cpcbl_launch.simulation.robot import Noise, SimulatedRobot, VisibleObject
+from cpcbl_launch.simulation.true_map import true_map
 from cpcbl_team.config import SimulationEvent, Team
 from cpcbl_team.geometry import Pose2, wrap_angle
 from cpcbl_team.inputs import Sightings
@@ -67,13 +70,13 @@ class SimulatedField:
             for i, (name, robot) in enumerate(team.robots.items())
             if robot.source == "simulated"
         }
-        self._cameras = None
+        self._map, self._cameras = true_map(team, seed), None
         if team.renders:  # OpenCV is loaded for nobody else
             from cpcbl_launch.simulation.camera.cameras import Cameras
 
-            self._cameras = Cameras(team, seed)
+            self._cameras = Cameras(replace(team, map=self._map), seed)
         self.skipped_frames = 0  # frames that were due in steps without pictures
-        landmarks = team.map.landmarks.items()
+        landmarks = self._map.landmarks.items()
         self._landmarks = [VisibleObject(name, m.x_m, m.y_m, m.gives) for name, m in landmarks]
         self._landmarks_to_bump = Grid(team.simulation.bump_radius_m, self._landmarks)
         self._start_ns = start_ns
@@ -169,7 +172,7 @@ class SimulatedField:
         yield from (mate for mate in mates.near(pose.x, pose.y) if mate.name != viewer)
 
     def _nearest_wall_points(self, pose: Pose2) -> Iterable[VisibleObject]:
-        for name, wall in self.team.map.walls.items():
+        for name, wall in self._map.walls.items():
             (ax, ay), (bx, by) = wall.from_m, wall.to_m
             length = math.hypot(bx - ax, by - ay)
             ux, uy = (bx - ax) / length, (by - ay) / length

@@ -104,7 +104,7 @@ def worlds() -> dict[str, World]:
         team = with_settings(_alone(_field(4, gives)), None, start=wide)
         found[f"wide prior{text}"] = World(team, ("r",))
     found |= _odometry_worlds() | _unknown_pose_worlds()
-    return found | _team_worlds() | _miscalibrated_worlds()
+    return found | _team_worlds() | _miscalibrated_worlds() | _uncertain_map_worlds()
 
 
 def _landmarks(count: int) -> str:
@@ -213,3 +213,39 @@ def _miscalibrated_worlds() -> dict[str, World]:
         world = World(_alone(field), ("r",), truth=truth)
         found[name] = world._replace(duration_s=2.0 * LEARNING_S, scored_from_s=LEARNING_S)
     return found
+
+
+def _uncertain_map_worlds() -> dict[str, World]:
+    """Robots whose map is right to 10 cm, and its walls to 5 cm and 2 deg."""
+    found: dict[str, World] = {}
+    for gives, text in KINDS:
+        for count in (1, 2, 4, 8):
+            team = _with_uncertain_map(_alone(_field(count, gives)))
+            found[f"uncertain map, {_landmarks(count)}{text}"] = World(team, ("r",))
+    standing = _with_uncertain_map(_alone(_field(2), waypoints_m=()))
+    found["uncertain map, 2 landmarks, standing"] = World(standing, ("r",))
+    walls = Field(walls=all_robots().map.walls)
+    found["uncertain walls"] = World(_with_uncertain_map(_alone(walls)), ("r",))
+    away = SimulationEvent(at_s=10.0, kidnap="r", to=(5.5, 4.0, 200.0))
+    carried = _with_uncertain_map(_alone(_field(4), away))
+    found["uncertain map, carried away"] = World(carried, ("r",), scored_from_s=20.0)
+    unknown = _with_uncertain_map(_alone(_field(4), start=None))
+    found["uncertain map, start unknown"] = World(unknown, ("r",))
+    rare = _hidden(10.0, DURATION_S)
+    for name, world in (
+        ("landmarks 1 s in 10", World(_alone(_field(4), *rare), ("r",))),
+        ("clique", _seeing("abcd")),
+        ("clique, one sees landmarks", _seeing("a")),
+        ("ring, landmarks 1 s in 10", _seeing("abcd", *rare, ahead=True)),
+    ):
+        found[f"uncertain map, {name}"] = world._replace(team=_with_uncertain_map(world.team))
+    return found
+
+
+def _with_uncertain_map(team: Team) -> Team:
+    landmarks = {n: replace(m, sigma_m=0.1) for n, m in team.map.landmarks.items()}
+    walls = {
+        n: replace(wall, sigma_m=0.05, direction_sigma_deg=2.0)
+        for n, wall in team.map.walls.items()
+    }
+    return replace(team, map=Field(landmarks=landmarks, walls=walls))

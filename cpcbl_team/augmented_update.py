@@ -1,0 +1,167 @@
+"""Updates of a pose together with the errors that the readings have in common."""
+
+from collections.abc import Callable, Iterable
+from typing import NamedTuple
+
+from cpcbl_team.common_errors import CAMERA, CommonErrors
+from cpcbl_team.estimate import (
+    POSE,
+    ZERO3,
+    Covariance3,
+    Estimate,
+    Row,
+    offset_pose,
+    sharpest,
+)
+from cpcbl_team.fusion import Observation, best_weight
+from cpcbl_team.gaussian import Covariance2
+from cpcbl_team.parameters import Numbers, Sensitivity, dot, sensitivity_dot
+
+
+class Reading(NamedTuple):
+    """A scalar: residual = row . pose's error + sensitivity . common errors + noise."""
+
+    row: Row
+    sensitivity: Sensitivity
+    residual: float
+    variance: float  # of the noise
+
+
+class AugmentedUpdate:
+    """Scalar updates, one after the other, of a pose and of the common errors. All are linearized
+    at the prior."""
+
+    def __init__(
+        self,
+        covariance: Covariance3,
+        common: CommonErrors,
+        estimated: tuple[bool, ...] = (),
+        inflation: float = 1.0,
+        heading_only: bool = False,
+    ) -> None:
+        """`estimated`: which of the common errors are estimated, not only considered; none if it is
+        empty. `inflation`: of all covariances, by covariance intersection; then none is estimated.
+        `heading_only`: the position is only considered."""
+        self._estimated, self._heading_only = estimated, heading_only
+        self._common = common
+        self._parameters = common.parameters  # as they are right whatever the inflation
+        self._inflated = self._parameters
+        self.covariance = covariance
+        if inflation != 1.0:
+            self.covariance = covariance.scaled(inflation)
+            self._inflated = self._parameters.inflated(inflation)
+        self._offset: Row = (0.0, 0.0, 0.0)
+        self._changes: Numbers = (0.0,) * len(common.values)
+
+    def add(self, reading: Reading) -> None:
+        """One more reading."""
+        h, c, residual, variance = reading
+        (ax, ay, ah), of_reading = self._inflated.times(h, c)
+        px, py, ph = self.covariance.times(h)
+        gx, gy, gh = px + ax, py + ay, ph + ah  # P h + X c
+        total = dot(h, (gx, gy, gh)) + sensitivity_dot(c, of_reading) + sharpest(variance)
+        dx, dy, dh = self._offset
+        innovation = residual - dot(h, self._offset) - sensitivity_dot(c, self._changes)
+        k = 0.0 if self._heading_only else 1.0 / total
+        kx, ky, kh = gain = k * gx, k * gy, gh / total
+        self._offset = dx + kx * innovation, dy + ky * innovation, dh + kh * innovation
+        xx, xy, yy, xh, yh, hh = self.covariance
+        self.covariance = Covariance3(
+            xx - kx * gx, xy - kx * gy, yy - ky * gy, xh - gx * kh, yh - gy * kh, hh - gh * kh
+        )
+        if self._inflated is self._parameters:
+            self._inflated = self._parameters = self._parameters.after_gain(gain, of_reading)
+        else:
+            _, of_true = self._parameters.times(h, c)
+            self._parameters = self._parameters.after_gain(gain, of_true)
+            self._inflated = self._inflated.after_gain(gain, of_reading)
+        if self._estimated:
+            parts = zip(self._changes, of_reading, self._estimated, strict=True)
+            self._changes = tuple(
+                [d + r / total * innovation if is_one else d for d, r, is_one in parts]
+            )
+            self._parameters = self._parameters.after_innovation(of_reading, total, self._estimated)
+            self._inflated = self._parameters
+
+    def result(self, prior: Estimate) -> tuple[Estimate, CommonErrors]:
+        """The estimate and the common errors after all readings. What of the estimate came from
+        teammates is no longer kept apart."""
+        pose = offset_pose(prior.pose, self._offset, POSE)
+        shared = ZERO3 if prior.shared is ZERO3 else self.covariance
+        values = tuple([v + d for v, d in zip(self._common.values, self._changes, strict=True)])
+        common = self._common._replace(values=values, parameters=self._parameters)
+        return Estimate(pose, self.covariance, shared), common
+
+
+def estimated_of(common: CommonErrors, with_camera: bool) -> tuple[bool, ...]:
+    """Which of the common errors are estimated: the places of objects, perhaps the camera's."""
+    return (with_camera,) * CAMERA + (True,) * (len(common.values) - CAMERA)
+
+
+def updated(
+    prior: Estimate, common: CommonErrors, readings: Iterable[Reading], with_camera: bool
+) -> tuple[Estimate, CommonErrors]:
+    """After readings with independent noise. `with_camera`: whether the errors of the camera are
+    estimated."""
+    update = AugmentedUpdate(prior.covariance, common, estimated_of(common, with_camera))
+    for reading in readings:
+        update.add(reading)
+    if min(update.covariance.xx, update.covariance.yy, update.covariance.hh) < 0.0:
+        return prior, common
+    return update.result(prior)
+
+
+def updated_by_teammate(
+    prior: Estimate,
+    common: CommonErrors,
+    observation: Observation,
+    sensitivities: tuple[Sensitivity, ...],
+    splits: bool,
+    heading_only: bool = False,
+) -> tuple[Estimate, CommonErrors]:
+    """After an observation that holds a teammate's error, by split covariance intersection
+    (`fusion.merge_split`), or naively. The common errors are only considered: a teammate may have
+    its error from this camera, or from these places."""
+    if not splits:
+        update = AugmentedUpdate(prior.covariance, common)
+        for reading in independent_readings(observation, observation.noise(), sensitivities):
+            update.add(reading)
+        least = min(update.covariance.xx, update.covariance.yy, update.covariance.hh)
+        return (prior, common) if least < 0.0 else update.result(prior)
+
+    def attempt(weight: float) -> AugmentedUpdate:
+        inflation = 1.0 if prior.shared is ZERO3 else 1.0 / weight
+        update = AugmentedUpdate(prior.covariance, common, (), inflation, heading_only)
+        noise = observation.noise(1.0 / (1.0 - weight))
+        for reading in independent_readings(observation, noise, sensitivities):
+            update.add(reading)
+        return update
+
+    size: Callable[[Covariance3], float] = (
+        (lambda c: c.hh) if heading_only else Covariance3.determinant
+    )
+    weight, extent = best_weight(lambda w: size(attempt(w).covariance))
+    update = attempt(weight)
+    least = min(update.covariance.xx, update.covariance.yy, update.covariance.hh)
+    if extent >= size(prior.covariance) or least < 0.0:
+        return prior, common
+    estimate, common = update.result(prior)
+    return estimate._replace(shared=estimate.covariance), common
+
+
+def independent_readings(
+    observation: Observation, noise: Covariance2, sensitivities: tuple[Sensitivity, ...]
+) -> list[Reading]:
+    """The one or two scalars of an observation as independent ones."""
+    if len(sensitivities) == 2:
+        k, (first, second) = noise.xy / noise.xx, sensitivities
+        of_first = dict(first)
+        numbers = sorted({*of_first, *dict(second)})
+        of_second = dict(second)
+        both = [(i, of_second.get(i, 0.0) - k * of_first.get(i, 0.0)) for i in numbers]
+        sensitivities = first, tuple(both)
+    scalars = observation.independent_scalars(noise)
+    return [
+        Reading(row, sensitivity, residual, variance)
+        for (row, residual, variance), sensitivity in zip(scalars, sensitivities, strict=True)
+    ]

@@ -1,0 +1,162 @@
+"""The errors that a robot's sightings have in common, as the filter of that robot uses them."""
+
+import math
+from collections.abc import Sequence
+
+from msgspec.structs import replace
+
+from cpcbl_team.augmented_update import (
+    Reading,
+    independent_readings,
+    updated,
+    updated_by_teammate,
+)
+from cpcbl_team.common_errors import CommonErrors
+from cpcbl_team.config import CameraSettings, Field, LocalizationSettings
+from cpcbl_team.estimate import Estimate
+from cpcbl_team.fusion import Observation
+from cpcbl_team.gaussian import Covariance2
+from cpcbl_team.geometry import wrap_angle
+from cpcbl_team.inputs import Sighting
+from cpcbl_team.measurements import GatedObject, Measurement, observation_of
+from cpcbl_team.parameters import Sensitivity, sensitivity_dot
+from cpcbl_team.places import EXACT, place_covariance
+from cpcbl_team.state import State, with_common_errors
+
+_UNAFFECTED: tuple[Sensitivity, Sensitivity] = ((), ())
+
+
+def considers_common_errors(settings: LocalizationSettings) -> bool:
+    """Whether the filter may keep the errors that sightings have in common apart from those of each
+    sighting. The variants that estimate heading and position apart do not, nor where sigmas are the
+    paper's."""
+    rules = settings.localizer
+    return rules.variant == "joint" and not (rules.alternates or rules.paper_uncertainty)
+
+
+def considers_camera(settings: LocalizationSettings, camera: CameraSettings) -> bool:
+    """Whether the filter keeps the errors of this camera apart from those of each sighting."""
+    is_exact = camera.yaw_sigma_deg == 0.0 and camera.focal_share == 0.0
+    return considers_common_errors(settings) and not is_exact
+
+
+def common_error_filter(
+    settings: LocalizationSettings, field: Field, camera: CameraSettings | None
+) -> "CommonErrorFilter | None":
+    """The filter's part for errors that sightings have in common; None where there are none, or
+    where they are not kept apart."""
+    if camera is not None and not considers_camera(settings, camera):
+        camera = None
+    if camera is None and (field.is_exact or not considers_common_errors(settings)):
+        return None
+    return CommonErrorFilter(settings, field, camera)
+
+
+class CommonErrorFilter:
+    """Keeps what is known of the errors that one robot's sightings have in common together with
+    its pose."""
+
+    def __init__(
+        self, settings: LocalizationSettings, field: Field, camera: CameraSettings | None
+    ) -> None:
+        self._field = field
+        self._learns_camera = camera is not None and camera.self_calibration
+        self._splits = settings.collaboration.fusion == "split-ci"
+        self.prior = CommonErrors.of_camera(0.0, EXACT)
+        if camera is not None:
+            yaw, focal = math.radians(camera.yaw_sigma_deg) ** 2, camera.focal_share**2
+            axis = math.radians(camera.yaw_deg)
+            self.prior = CommonErrors.of_camera(axis, Covariance2(yaw, 0.0, focal))
+
+    def started(self, state: State) -> State:
+        """The state in which nothing but the settings and the map is known."""
+        return with_common_errors(state, self.prior)
+
+    def before_motion(self, state: State, distance: float, turn: float, seconds: float) -> State:
+        """The state before its pose moves by this (m, rad)."""
+        common = state.common_errors
+        assert common is not None
+        if distance != 0.0 or turn != 0.0:
+            common = common.after_motion(state.estimate.pose.heading, distance, turn)
+        return with_common_errors(state, common.after_time(seconds))
+
+    def with_object(self, state: State, name: str) -> State:
+        """The state that estimates the place of this object, if it is uncertain on the map."""
+        common = state.common_errors
+        assert common is not None
+        if name in common.objects or self._field.has_exact(name):
+            return state
+        covariance = place_covariance(self._field, name)
+        return with_common_errors(state, common.with_object(name, covariance))
+
+    def corrected(self, state: State, sighting: Sighting) -> Sighting:
+        """The sighting without the errors of the camera that are known."""
+        common = state.common_errors
+        assert common is not None
+        return common.corrected(sighting)
+
+    def as_evidence(self, state: State, m: Measurement) -> Measurement:
+        """The measurement with sigmas that include the errors of the camera: for what has no place
+        for them."""
+        common = state.common_errors
+        assert common is not None
+        (yaw, _, focal), range_m = common.camera_covariance, m.range_m or 0.0
+        return replace(
+            m,
+            range_sigma=math.hypot(m.range_sigma, math.sqrt(focal) * range_m),
+            bearing_sigma=math.hypot(m.bearing_sigma, math.sqrt(yaw)),
+        )
+
+    def correct(self, state: State, accepted: Sequence[GatedObject]) -> tuple[State, Estimate]:
+        """Steps 4 and 5: the state that knows the common errors better, and the estimate after the
+        objects of the map and then, one by one, the teammates."""
+        prior, common = state.estimate, state.common_errors
+        assert common is not None
+        before = common.values
+        readings = [
+            Reading(c.row, sensitivity, c.residual, c.sigma * c.sigma)
+            for found in accepted
+            if not found.measurement.is_teammate
+            for c, sensitivity in zip(found.constraints, found.sensitivities, strict=True)
+        ]
+        estimate = prior
+        if readings:
+            estimate, common = updated(prior, common, readings, self._learns_camera)
+        for found in accepted:
+            m = found.measurement
+            if not m.is_teammate:
+                continue
+            observation = observation_of(prior, m, found.constraints)
+            moved = [b - a for a, b in zip(prior.pose, estimate.pose, strict=True)]
+            observation = observation.shifted(moved[0], moved[1], wrap_angle(moved[2]))
+            known = tuple(b - a for a, b in zip(before, common.values, strict=True))
+            residuals = tuple(
+                e - sensitivity_dot(c, known)
+                for e, c in zip(observation.residuals, found.sensitivities, strict=True)
+            )
+            estimate, common = updated_by_teammate(
+                estimate,
+                common,
+                observation._replace(residuals=residuals),
+                found.sensitivities,
+                self._splits,
+                m.is_for_heading,
+            )
+        return with_common_errors(state, common), estimate
+
+    def observed(
+        self, state: State, prior: Estimate, observation: Observation, by_teammate: bool
+    ) -> tuple[State, Estimate]:
+        """The state and the estimate after a teammate, or the position sensor, observed the pose
+        of the prior."""
+        common = state.common_errors
+        assert common is not None
+        unaffected = _UNAFFECTED[: len(observation.rows)]
+        if by_teammate:
+            prior, common = updated_by_teammate(
+                prior, common, observation, unaffected, self._splits
+            )
+        else:
+            readings = independent_readings(observation, observation.noise(), unaffected)
+            prior, common = updated(prior, common, readings, self._learns_camera)
+        return with_common_errors(state, common), prior
