@@ -19,9 +19,11 @@ from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.geometry import wrap_angle
 from cpcbl_team.inputs import Sighting
 from cpcbl_team.measurements import GatedObject, Measurement, observation_of
+from cpcbl_team.new_landmarks import LandmarkReading, relative_place, with_reading
 from cpcbl_team.parameters import Sensitivity, sensitivity_dot
 from cpcbl_team.places import EXACT, place_covariance
-from cpcbl_team.state import State, with_common_errors
+from cpcbl_team.sensors import sighting_sigmas
+from cpcbl_team.state import State, with_common_errors, with_memory
 
 _UNAFFECTED: tuple[Sensitivity, Sensitivity] = ((), ())
 
@@ -59,7 +61,7 @@ class CommonErrorFilter:
     def __init__(
         self, settings: LocalizationSettings, field: Field, camera: CameraSettings | None
     ) -> None:
-        self._field = field
+        self._field, self._sensor = field, settings.sensor
         self._learns_camera = camera is not None and camera.self_calibration
         self._splits = settings.collaboration.fusion == "split-ci"
         self.prior = CommonErrors.of_camera(0.0, EXACT)
@@ -88,6 +90,41 @@ class CommonErrorFilter:
             return state
         covariance = place_covariance(self._field, name)
         return with_common_errors(state, common.with_object(name, covariance))
+
+    def has_no_place(self, state: State, name: str) -> bool:
+        """Whether nobody has surveyed this landmark, and the robot does not know its place yet."""
+        common = state.common_errors
+        assert common is not None
+        return name in self._field.unsurveyed and name not in common.objects
+
+    def with_reading(self, state: State, sighting: Sighting, now_ns: int) -> State:
+        """The state after a sighting of a landmark whose place is not known yet: with its place, if
+        that is determined now."""
+        common, name = state.common_errors, sighting.id
+        assert common is not None
+        if state.lost:
+            return state
+        mark = self._field.unsurveyed[name]
+        range_m = sighting.range_m if mark.gives in ("both", "range") else None
+        if range_m is not None and range_m > self._sensor.max_range_for_range_m:
+            range_m = None
+        bearing = sighting.bearing_rad if mark.gives in ("both", "bearing") else None
+        if range_m is None and bearing is None:
+            return state
+        place, read = state.odometry_from_robot, (range_m, bearing)
+        reading = LandmarkReading(now_ns, place, *read, *sighting_sigmas(sighting, self._sensor))
+        memory = state.memory.calibration
+        readings = with_reading(memory.unplaced.get(name, ()), reading)
+        found = relative_place(readings, place)
+        unplaced = {n: r for n, r in memory.unplaced.items() if n != name}
+        if found is None:
+            memory = memory._replace(unplaced={**unplaced, name: readings})
+        else:
+            if self._sensor.correlation_s > 0.0:  # many readings tell no more than one
+                found = found._replace(covariance=found.covariance.scaled(len(readings)))
+            common = common.with_place(name, state.estimate, found)
+            memory = memory._replace(unplaced=unplaced, common=common)
+        return with_memory(state, state.memory._replace(calibration=memory))
 
     def corrected(self, state: State, sighting: Sighting) -> Sighting:
         """The sighting without the errors of the camera that are known."""

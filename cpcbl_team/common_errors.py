@@ -19,8 +19,8 @@ from cpcbl_team.camera_errors import (
     range_sensitivity,
     without_errors,
 )
-from cpcbl_team.estimate import Row
-from cpcbl_team.gaussian import Covariance2
+from cpcbl_team.estimate import Estimate, Row
+from cpcbl_team.gaussian import Covariance2, Gaussian2
 from cpcbl_team.inputs import Sighting
 from cpcbl_team.motion import motion_jacobian
 from cpcbl_team.parameters import (
@@ -94,6 +94,29 @@ class CommonErrors(NamedTuple):
         parameters = self.parameters.with_more(((xx, xy), (xy, yy)))
         return CommonErrors(self.axis_rad, (*self.values, 0.0, 0.0), parameters, objects)
 
+    def with_place(self, name: str, own: Estimate, place: Gaussian2) -> "CommonErrors":
+        """With an object that the robot has seen at this place in its own frame (m). Its parameters
+        are its position in the field's frame."""
+        heading = own.pose.heading
+        x, y = own.pose.transform(place.x, place.y)
+        dx, dy = x - own.pose.x, y - own.pose.y
+        rows = (1.0, 0.0, -dy), (0.0, 1.0, dx)
+        sensitivities = self._of_point(dx, dy, math.atan2(place.y, place.x))
+        covariance = place.covariance.rotated(heading) + own.covariance.projected(rows)
+        covariance += self.innovation(rows, sensitivities)
+        of_pose, of_others = [], []
+        for h, c in zip(rows, sensitivities, strict=True):
+            (ax, ay, ah), numbers = self.parameters.times(h, c)
+            px, py, ph = own.covariance.times(h)
+            of_pose.append((px + ax, py + ay, ph + ah))
+            of_others.append(numbers)
+        xx, xy, yy = covariance
+        parameters = self.parameters.with_derived(
+            ((xx, xy), (xy, yy)), tuple(of_pose), tuple(of_others)
+        )
+        objects = {**self.objects, name: len(self.values)}
+        return CommonErrors(self.axis_rad, (*self.values, x, y), parameters, objects)
+
     def corrected(self, sighting: Sighting) -> Sighting:
         """The sighting without the errors of the camera that are known."""
         return without_errors(sighting, self.errors, self.axis_rad)
@@ -161,10 +184,17 @@ class CommonErrors(NamedTuple):
     def of_point(self, dx: float, dy: float, bearing_rad: float) -> Covariance2:
         """What they add to the covariance (m^2) of a point that is seen at this bearing, (dx, dy)
         away in the field's frame. It may be negative: they explain errors of the pose."""
+        rows = (1.0, 0.0, -dy), (0.0, 1.0, dx)
+        return self.innovation(rows, self._of_point(dx, dy, bearing_rad))
+
+    def _of_point(
+        self, dx: float, dy: float, bearing_rad: float
+    ) -> tuple[Sensitivity, Sensitivity]:
+        """How the place of such a point follows the errors of the camera."""
         off_axis = bearing_rad - self.axis_rad
         _, along = range_sensitivity(1.0, off_axis)
         _, across = bearing_sensitivity(off_axis)
         # a reading that is too large puts the point too far
         of_x = (0, dy), (1, -along * dx + across * dy)
         of_y = (0, -dx), (1, -along * dy - across * dx)
-        return self.innovation(((1.0, 0.0, -dy), (0.0, 1.0, dx)), (of_x, of_y))
+        return of_x, of_y

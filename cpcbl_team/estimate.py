@@ -49,6 +49,14 @@ class Covariance3(NamedTuple):
         xx, xy, yy, xh, yh, hh = self
         return xx * x + xy * y + xh * a, xy * x + yy * y + yh * a, xh * x + yh * y + hh * a
 
+    def projected(self, rows: tuple["Row", "Row"]) -> Covariance2:
+        """H C H^T of two rows."""
+        (a, b, c), (d, e, f) = rows
+        px, py, ph = self.times(rows[0])
+        qx, qy, qh = self.times(rows[1])
+        xx, xy, yy = a * px + b * py + c * ph, d * px + e * py + f * ph, d * qx + e * qy + f * qh
+        return Covariance2(xx, xy, yy)
+
     def determinant(self) -> float:
         a, b, d, c, e, f = self
         return a * (d * f - e * e) - b * (b * f - e * c) + c * (b * e - d * c)

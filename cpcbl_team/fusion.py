@@ -112,6 +112,12 @@ def chi_square_bounds(probability: float) -> tuple[float, float]:
     return NormalDist().inv_cdf(0.5 + 0.5 * probability) ** 2, -2.0 * math.log(1.0 - probability)
 
 
+def chi_square_bound(freedom: int) -> float:
+    """About the 99.9 % quantile (Wilson & Hilferty 1931)."""
+    k = max(freedom, 1)
+    return k * (1.0 - 2.0 / (9.0 * k) + 3.09 * math.sqrt(2.0 / (9.0 * k))) ** 3
+
+
 def merge_naive(prior: Estimate, observation: Observation, scope: Scope = POSE) -> Estimate:
     """The paper's collaboration: the teammate's error is treated as independent noise."""
     return merge(prior, observation.information(), scope)

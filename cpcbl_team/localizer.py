@@ -202,6 +202,9 @@ class Localizer:
             if self._common is not None:
                 state = self._common.with_object(state, sighting.id)
                 sighting = self._common.corrected(state, sighting)
+                if self._common.has_no_place(state, sighting.id):
+                    state = self._common.with_reading(state, sighting, now_ns)
+                    continue
             m = measurement_of(
                 sighting, now_ns, pose, self.field, beliefs, self.settings, state.common_errors
             )

@@ -25,6 +25,7 @@ class MotionVariance(NamedTuple):
     turn: float  # rad^2
 
 
+DRIFT_SHARE: Final = 0.1  # of the way: how far dead reckoning errs, roughly
 NO_VARIANCE: Final = MotionVariance(0.0, 0.0)
 FASTEST: Final = 50.0  # m/s and rad/s: a piece of odometry that is faster is too short to tell
 
@@ -178,3 +179,9 @@ def inflate_by_gap(
     growth = (gap_speed_m_s**2 + fastest**2) * gap_ns * 1e-9
     added = Covariance3(growth, 0.0, growth, 0.0, 0.0, growth)
     return estimate._replace(covariance=estimate.covariance.plus(added))
+
+
+def drift_sigmas(moved: Pose2) -> tuple[float, float]:
+    """How far dead reckoning over such a motion errs, roughly (m, rad)."""
+    way, turn = math.hypot(moved.x, moved.y), abs(moved.heading)
+    return DRIFT_SHARE * (way + 0.3 * turn), DRIFT_SHARE * (turn + 0.3 * way)

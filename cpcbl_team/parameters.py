@@ -90,6 +90,18 @@ class Parameters(NamedTuple):
         rows += [(0.0,) * n + row for row in covariance]
         return Parameters(tuple(rows), self.with_pose + (NO_COVARIANCE,) * m)
 
+    def with_derived(
+        self,
+        covariance: tuple[Numbers, ...],
+        with_pose: tuple[Row, ...],
+        with_others: tuple[Numbers, ...],
+    ) -> "Parameters":
+        """With more parameters, of this covariance: with the pose, and with those of before."""
+        columns = tuple(zip(*with_others, strict=True))
+        rows = [row + column for row, column in zip(self.covariance, columns, strict=True)]
+        rows += [others + row for others, row in zip(with_others, covariance, strict=True)]
+        return Parameters(tuple(rows), self.with_pose + with_pose)
+
 
 def dot(row: Row, other: Row) -> float:
     return row[0] * other[0] + row[1] * other[1] + row[2] * other[2]

@@ -31,9 +31,15 @@ class MapObject(NamedTuple):
 
 
 def map_object(field: Field, name: str, common: CommonErrors | None = None) -> MapObject | None:
-    """The object of this name; None if it is not on the map. `common`: of a robot that estimates
+    """The object of this name; None if its place is not known. `common`: of a robot that estimates
     the places of objects with its pose."""
     is_estimated = common is not None and name in common.objects
+    unsurveyed = field.unsurveyed.get(name)
+    if unsurveyed is not None:
+        if common is None or not is_estimated:
+            return None
+        position = ObjectPosition(*common.place_error(name), common.place_covariance(name))
+        return MapObject(position, None, unsurveyed.gives)
     landmark = field.landmarks.get(name)
     if landmark is not None:
         x, y, covariance = _point(landmark)

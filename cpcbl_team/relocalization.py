@@ -26,11 +26,11 @@ from cpcbl_team.estimate import (
     merge,
     offset_pose,
 )
+from cpcbl_team.fusion import chi_square_bound
 from cpcbl_team.geometry import Pose2, wrap_angle
-from cpcbl_team.motion import motion_noise
+from cpcbl_team.motion import drift_sigmas, motion_noise
 from cpcbl_team.state import Evidence
 
-DRIFT_SHARE = 0.1  # of the way: how far dead reckoning errs, while a pose is looked for
 DRIFT_FACTOR = 1.0  # on the variance of the odometry's noise
 MOST_STARTS = 10
 CELLS = 5, 4, 8  # of x, y and heading: from the middle of each a pose is looked for
@@ -90,12 +90,6 @@ def relocalize(
         return None
     covariance = widened.scaled(max(1.0, cost / freedom))
     return Estimate(estimate.pose, covariance, covariance if repeated else ZERO3)
-
-
-def drift_sigmas(moved: Pose2) -> tuple[float, float]:
-    """How far dead reckoning over such a motion errs, while a pose is looked for (m, rad)."""
-    way, turn = math.hypot(moved.x, moved.y), abs(moved.heading)
-    return DRIFT_SHARE * (way + 0.3 * turn), DRIFT_SHARE * (turn + 0.3 * way)
 
 
 def readings_of(e: Evidence) -> int:
@@ -389,9 +383,3 @@ def _is_certain(estimate: Estimate) -> bool:
 def are_apart(a: Pose2, b: Pose2) -> bool:
     turn = math.remainder(a.heading - b.heading, math.tau)
     return math.hypot(a.x - b.x, a.y - b.y) > 0.5 or abs(turn) > 0.5
-
-
-def chi_square_bound(freedom: int) -> float:
-    """About the 99.9 % quantile (Wilson & Hilferty 1931)."""
-    k = max(freedom, 1)
-    return k * (1.0 - 2.0 / (9.0 * k) + 3.09 * math.sqrt(2.0 / (9.0 * k))) ** 3

@@ -12,11 +12,11 @@ from collections.abc import Callable, Sequence
 from typing import Final, NamedTuple
 
 from cpcbl_team.estimate import POSE, Estimate, FilteredOffset, offset_pose
+from cpcbl_team.fusion import chi_square_bound
 from cpcbl_team.geometry import Pose2
 from cpcbl_team.relocalization import (
     OUTLIER,
     PropagatedEvidence,
-    chi_square_bound,
     readings_of,
 )
 from cpcbl_team.state import Evidence

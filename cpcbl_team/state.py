@@ -24,6 +24,7 @@ from cpcbl_team.miscalibration import (
     ModelCheck,
     with_doubts,
 )
+from cpcbl_team.new_landmarks import LandmarkReading
 from cpcbl_team.range_errors import RangeEvidence
 from cpcbl_team.self_calibration import ReferencePoses, SelfCalibration
 from cpcbl_team.sender_records import SenderRecord
@@ -167,6 +168,8 @@ class CalibrationMemory(NamedTuple):
     """What is known of the constant errors of the camera; None without a camera whose errors the
     filter considers."""
     residuals: MapResiduals = MapResiduals()
+    unplaced: Mapping[str, tuple[LandmarkReading, ...]] = _NONE
+    """What was read of landmarks whose places are not known yet."""
 
     @property
     def corrected(self) -> SelfCalibration:

@@ -10,8 +10,10 @@ from collections.abc import Callable, Sequence
 from typing import Final
 
 from cpcbl_team.estimate import Covariance3, Estimate
+from cpcbl_team.fusion import chi_square_bound
 from cpcbl_team.geometry import Pose2
-from cpcbl_team.relocalization import UNKNOWNS, are_apart, chi_square_bound, drift_sigmas
+from cpcbl_team.motion import drift_sigmas
+from cpcbl_team.relocalization import UNKNOWNS, are_apart
 from cpcbl_team.sensor_mistakes import ExplainingMistake, mistake_in_evidence
 from cpcbl_team.state import Evidence, Jump, RecoveryMemory, State, TrustedPose, with_recovery
 

@@ -53,7 +53,7 @@ class FilterAgent:
         self._field = field
         has_own = settings.position_sensor is not None  # which may lead it anywhere
         self._farthest_m = math.inf if has_own else 2.0 * settings.sensor.max_range_m
-        self._known = frozenset(field.landmarks) | frozenset(field.walls) | teammates
+        self._known = field.names | teammates
         self._guests: set[str] = set()
         self._moves = settings.odometry.moves
         self._learns = settings.localizer.learns

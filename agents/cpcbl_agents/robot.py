@@ -71,7 +71,7 @@ class Robot:
         self._sightings_input = "frame" if settings.sensing == "camera" else "sightings"
         match = team.messages_per_s(name), restarted, team.match.duration_s
         budget = Budget(settings.collaboration.budget, start_ns, *match)
-        known = frozenset(team.map.landmarks) | frozenset(team.map.walls) | frozenset(team.robots)
+        known = team.map.names | frozenset(team.robots)
         guests = GuestRegistry(known, team.guests.most if team.guests.allowed else 0)
         self.collaboration = CollaborationAgent(name, settings, teammates, start_ns, budget, guests)
 
@@ -236,7 +236,7 @@ def build_sensing(
 ) -> SensingAgent:
     """The sensing agent of a robot that reads this source and this camera."""
     settings = team.robots[name]
-    map_names = frozenset(team.map.landmarks) | frozenset(team.map.walls)
+    map_names = team.map.names
     follower = None
     if settings.source == "simulated":
         follower = WaypointFollower(name, settings.waypoints_m, settings.speed_m_s)

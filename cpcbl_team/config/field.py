@@ -31,6 +31,17 @@ class Landmark(Table, frozen=True, kw_only=True):
         return self.sigma_m == 0.0 and not any(self.covariance_m2 or ())
 
 
+class Unsurveyed(Table, frozen=True, kw_only=True):
+    """A point whose position nobody knows beforehand: the robots that see it find out."""
+
+    gives: Gives = "both"
+    """Which measurements of it the robots use."""
+    colours: Bands | None = None
+    """As of a landmark."""
+    true_m: tuple[float, float] | None = None
+    """Where it stands on the simulated field, in the field's frame. No robot knows it."""
+
+
 class Wall(Table, frozen=True, kw_only=True):
     """A straight surface from one point of the field to another."""
 
@@ -57,6 +68,12 @@ class Field(Table, frozen=True, kw_only=True):
 
     landmarks: dict[str, Landmark] = msgspec.field(default_factory=dict)
     walls: dict[str, Wall] = msgspec.field(default_factory=dict)
+    unsurveyed: dict[str, Unsurveyed] = msgspec.field(default_factory=dict)
+
+    @property
+    def names(self) -> frozenset[str]:
+        """The names of all that robots may see, but for robots."""
+        return frozenset((*self.landmarks, *self.walls, *self.unsurveyed))
 
     @property
     def gives_only_ranges(self) -> bool:
@@ -67,12 +84,14 @@ class Field(Table, frozen=True, kw_only=True):
 
     @property
     def is_exact(self) -> bool:
-        """Whether all places on the map are known exactly."""
+        """Whether all places of objects are known exactly."""
+        if self.unsurveyed:
+            return False
         points = all(landmark.is_exact for landmark in self.landmarks.values())
         return points and all(wall.is_exact for wall in self.walls.values())
 
     def has_exact(self, name: str) -> bool:
-        """Whether the place of this object is known exactly, if it is on the map at all."""
+        """Whether the place of this object is known exactly, if any is known."""
         mark, wall = self.landmarks.get(name), self.walls.get(name)
         return (mark is None or mark.is_exact) and (wall is None or wall.is_exact)
 

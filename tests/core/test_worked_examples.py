@@ -33,13 +33,13 @@ from cpcbl_team.estimate import (
     Estimate,
     Scope,
 )
-from cpcbl_team.fusion import Observation, _merge_with_weight, chi_square_bounds
+from cpcbl_team.fusion import Observation, _merge_with_weight, chi_square_bound, chi_square_bounds
 from cpcbl_team.geometry import Pose2
 from cpcbl_team.inputs import Odometry
 from cpcbl_team.measurements import Measurement, observation_of
 from cpcbl_team.motion import bridge, inflate_by_gap
 from cpcbl_team.places import ObjectPosition
-from cpcbl_team.relocalization import PropagatedEvidence, chi_square_bound, relocalize
+from cpcbl_team.relocalization import PropagatedEvidence, relocalize
 from cpcbl_team.state import Evidence
 
 ORIGIN = Pose2(0.0, 0.0, 0.0)

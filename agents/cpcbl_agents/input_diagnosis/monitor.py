@@ -166,7 +166,7 @@ class InputMonitor:
             robot,
             {},
             tuple(_expected_inputs(settings)),
-            frozenset(team.map.landmarks) | frozenset(team.map.walls) | frozenset(team.robots),
+            team.map.names | frozenset(team.robots),
             team.map.landmarks,
             settings.sensor,
             wheels,

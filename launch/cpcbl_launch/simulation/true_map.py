@@ -11,16 +11,23 @@ _SEED = 2**29  # apart from robots' own noise
 
 
 def true_map(team: Team, seed: int) -> Field:
-    """The true places of the map's objects, which have an error of their own each: its standard
-    deviations are those of the map times the simulation's noise."""
+    """The true places of all objects, also of those that nobody has surveyed. Those of the map have
+    an error each: its standard deviations are the map's times the simulation's noise."""
     if team.map.is_exact:
         return team.map
     noise = team.simulation.noise
+    found = {
+        name: Landmark(
+            x_m=mark.true_m[0], y_m=mark.true_m[1], gives=mark.gives, colours=mark.colours
+        )
+        for name, mark in team.map.unsurveyed.items()
+        if mark.true_m is not None
+    }
     landmarks = {
         n: _true_landmark(team.map, n, m, seed, noise) for n, m in team.map.landmarks.items()
     }
     walls = {n: _true_wall(team.map, n, wall, seed, noise) for n, wall in team.map.walls.items()}
-    return Field(landmarks=landmarks, walls=walls)
+    return Field(landmarks=landmarks | found, walls=walls)
 
 
 def _true_landmark(field: Field, name: str, mark: Landmark, seed: int, noise: float) -> Landmark:

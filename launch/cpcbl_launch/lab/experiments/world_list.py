@@ -18,6 +18,7 @@ from cpcbl_team.config import (
     SimulationEvent,
     Start,
     Team,
+    Unsurveyed,
 )
 
 DURATION_S = 40.0
@@ -104,7 +105,13 @@ def worlds() -> dict[str, World]:
         team = with_settings(_alone(_field(4, gives)), None, start=wide)
         found[f"wide prior{text}"] = World(team, ("r",))
     found |= _odometry_worlds() | _unknown_pose_worlds()
-    return found | _team_worlds() | _miscalibrated_worlds() | _uncertain_map_worlds()
+    return (
+        found
+        | _team_worlds()
+        | _miscalibrated_worlds()
+        | _uncertain_map_worlds()
+        | _unsurveyed_worlds()
+    )
 
 
 def _landmarks(count: int) -> str:
@@ -240,6 +247,34 @@ def _uncertain_map_worlds() -> dict[str, World]:
     ):
         found[f"uncertain map, {name}"] = world._replace(team=_with_uncertain_map(world.team))
     return found
+
+
+def _unsurveyed_worlds() -> dict[str, World]:
+    """Robots that know their start, and the places of few landmarks or of none."""
+    found: dict[str, World] = {}
+    for gives, text in KINDS:
+        for known in (0, 2):
+            team = _with_unsurveyed(_alone(_field(8, gives)), known)
+            name = f"unsurveyed{text}, {known} of 8 known"
+            found[name] = World(team, ("r",), duration_s=LEARNING_S)
+    rare = _hidden(10.0, LEARNING_S)
+    team = _with_unsurveyed(_alone(_field(8), *rare), 0)
+    found["unsurveyed, landmarks 1 s in 10"] = World(team, ("r",), duration_s=LEARNING_S)
+    for seeing in ("a", "abcd"):
+        team = _with_unsurveyed(_seeing(seeing).team, 0)
+        name = f"unsurveyed, clique, {len(seeing)} of 4 see landmarks"
+        found[name] = World(team, tuple("abcd"), duration_s=LEARNING_S)
+    return found
+
+
+def _with_unsurveyed(team: Team, known: int) -> Team:
+    """The team that knows the places of so many landmarks only."""
+    marks = list(team.map.landmarks.items())
+    unsurveyed = {
+        name: Unsurveyed(gives=mark.gives, true_m=(mark.x_m, mark.y_m))
+        for name, mark in marks[known:]
+    }
+    return replace(team, map=Field(landmarks=dict(marks[:known]), unsurveyed=unsurveyed))
 
 
 def _with_uncertain_map(team: Team) -> Team:

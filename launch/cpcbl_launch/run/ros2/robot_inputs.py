@@ -75,7 +75,7 @@ class RobotInputs:
         note = partial(refusals.add, topic)
         self.odometry = OdometryInput(settings.ros2, self.map_frame, note)
         self._tags: TagInput | None = None
-        self._names = frozenset(team.map.landmarks) | frozenset(team.map.walls)
+        self._names = team.map.names
         self._names |= frozenset(team.robots) - {name}
         note = partial(refusals.add, team.ros2.topic(name, settings.ros2.tf_static))
         self._mounting = CameraMounting(name, settings.camera, note)

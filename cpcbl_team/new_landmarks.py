@@ -1,0 +1,154 @@
+"""Landmarks whose places nobody has surveyed: where one is, from what a robot has read of it.
+
+The readings of the last seconds are brought to the present by dead reckoning, which gives the place
+in the robot's frame by least squares. One reading of range and bearing is a place; bearings alone
+are one when they were taken from places far enough apart (parallax), and so are ranges alone.
+"""
+
+import math
+from collections.abc import Iterator, Sequence
+from typing import Final, NamedTuple
+
+from cpcbl_team.fusion import chi_square_bound
+from cpcbl_team.gaussian import Covariance2, Gaussian2
+from cpcbl_team.geometry import Pose2, wrap_angle
+from cpcbl_team.motion import drift_sigmas
+
+LEAST_READINGS: Final = 3  # one alone may have a wrong name
+MOST_READINGS: Final = 20
+SPACING_NS: Final = 200_000_000  # between two that are kept
+WINDOW_NS: Final = 20_000_000_000
+LARGEST_SHARE: Final = 0.15  # sigma by distance: beyond, the place cannot be linearized
+RIVAL: Final = (
+    9.0  # another place whose chi-square is larger by less than this may be the right one
+)
+APART_SIGMAS: Final = 3.0
+FARTHEST_M: Final = 1000.0
+_DISTANCES_M: Final = (1.0, 3.0, 10.0)  # along a bearing without a range: a place is looked for
+_DIRECTIONS: Final = 8  # around a range without a bearing
+_ITERATIONS: Final = 15
+
+
+class LandmarkReading(NamedTuple):
+    """One reading of a landmark that is not on the map."""
+
+    stamp_ns: int
+    odometry_from_robot: Pose2  # dead reckoning at that time
+    range_m: float | None
+    bearing_rad: float | None
+    range_sigma_m: float
+    bearing_sigma_rad: float
+
+
+def with_reading(
+    readings: tuple[LandmarkReading, ...], reading: LandmarkReading
+) -> tuple[LandmarkReading, ...]:
+    """The readings with one more, without what is too old; the same if it comes too soon."""
+    if readings and reading.stamp_ns - readings[-1].stamp_ns < SPACING_NS:
+        return readings
+    young = [r for r in readings if reading.stamp_ns - r.stamp_ns <= WINDOW_NS]
+    return (*young[-MOST_READINGS + 1 :], reading)
+
+
+def relative_place(
+    readings: Sequence[LandmarkReading], odometry_from_robot: Pose2
+) -> Gaussian2 | None:
+    """The place that the readings determine, in the frame of the robot at this time; None where
+    they do not: too few, too little parallax, contradictory, or two places that fit."""
+    if len(readings) < LEAST_READINGS:
+        return None
+    now_from_odometry = odometry_from_robot.inverse()
+    seen = [_Seen(r, now_from_odometry @ r.odometry_from_robot) for r in readings]
+    fits = [_fit(x, y, seen) for x, y in _starts(seen)]
+    found = sorted((fit for fit in fits if fit is not None), key=lambda fit: fit[1])
+    if not found:
+        return None
+    place, cost = found[0]
+    x, y, covariance = place
+    freedom = sum((r.range_m is not None) + (r.bearing_rad is not None) for r in readings) - 2
+    spread = 0.5 * (covariance.xx + covariance.yy) + math.hypot(
+        0.5 * (covariance.xx - covariance.yy), covariance.xy
+    )
+    nearest = min(math.hypot(x - s.pose.x, y - s.pose.y) for s in seen)
+    if spread > (LARGEST_SHARE * nearest) ** 2 or freedom < 1 or cost > chi_square_bound(freedom):
+        return None
+    apart_m = APART_SIGMAS * math.sqrt(spread)
+    for (other_x, other_y, _), other_cost in found[1:]:
+        if math.hypot(other_x - x, other_y - y) > apart_m and other_cost < cost + RIVAL:
+            return None
+    return place
+
+
+class _Seen:
+    """A reading from where the robot was, seen from where it is."""
+
+    def __init__(self, reading: LandmarkReading, pose: Pose2) -> None:
+        self.pose, self.reading = pose, reading
+        self.drift_m, self.drift_rad = drift_sigmas(pose)
+
+    def rows(self, x: float, y: float) -> Iterator[tuple[float, float, float, float]]:
+        """(d/dx, d/dy, residual, variance) of what is expected of an object at (x, y)."""
+        dx, dy = x - self.pose.x, y - self.pose.y
+        distance = max(math.hypot(dx, dy), 1e-3)
+        u, v, r = dx / distance, dy / distance, self.reading
+        if r.range_m is not None:
+            variance = r.range_sigma_m**2 + self.drift_m**2
+            yield u, v, r.range_m - distance, variance
+        if r.bearing_rad is not None:
+            off = wrap_angle(r.bearing_rad + self.pose.heading - math.atan2(dy, dx))
+            variance = r.bearing_sigma_rad**2 + self.drift_rad**2 + (self.drift_m / distance) ** 2
+            yield -v / distance, u / distance, off, variance
+
+
+def _starts(seen: Sequence[_Seen]) -> Iterator[tuple[float, float]]:
+    """Places from which the best one is looked for: by the oldest and by the newest reading."""
+    for one in (seen[0], seen[-1]):
+        r, pose = one.reading, one.pose
+        turns = [2.0 * math.pi * k / _DIRECTIONS for k in range(_DIRECTIONS)]
+        bearings = turns if r.bearing_rad is None else [r.bearing_rad]
+        for distance in _DISTANCES_M if r.range_m is None else (r.range_m,):
+            for bearing in bearings:
+                yield pose.transform(distance * math.cos(bearing), distance * math.sin(bearing))
+
+
+def _fit(x: float, y: float, seen: Sequence[_Seen]) -> tuple[Gaussian2, float] | None:
+    """The place by least squares (Levenberg-Marquardt) from a start, and its chi-square."""
+    damping, cost = 1e-3, _cost(x, y, seen)
+    for _ in range(_ITERATIONS):
+        xx, xy, yy, bx, by = _normal_equations(x, y, seen)
+        a, c = xx * (1.0 + damping) + 1e-12, yy * (1.0 + damping) + 1e-12
+        determinant = a * c - xy * xy
+        if determinant <= 0.0:
+            return None
+        sx, sy = (c * bx - xy * by) / determinant, (a * by - xy * bx) / determinant
+        after = _cost(x + sx, y + sy, seen)
+        if after > cost:
+            damping *= 10.0
+            continue
+        x, y, cost, damping = x + sx, y + sy, after, 0.1 * damping
+        if math.hypot(sx, sy) < 1e-4:
+            break
+    if math.hypot(x, y) > FARTHEST_M:
+        return None
+    xx, xy, yy, _, _ = _normal_equations(x, y, seen)
+    determinant = xx * yy - xy * xy
+    if determinant <= 1e-12 * xx * yy:
+        return None
+    covariance = Covariance2(yy / determinant, -xy / determinant, xx / determinant)
+    return Gaussian2(x, y, covariance), cost
+
+
+def _normal_equations(
+    x: float, y: float, seen: Sequence[_Seen]
+) -> tuple[float, float, float, float, float]:
+    xx = xy = yy = bx = by = 0.0
+    for u, v, residual, variance in (row for one in seen for row in one.rows(x, y)):
+        w = 1.0 / max(variance, 1e-12)
+        xx, xy, yy = xx + w * u * u, xy + w * u * v, yy + w * v * v
+        bx, by = bx + w * u * residual, by + w * v * residual
+    return xx, xy, yy, bx, by
+
+
+def _cost(x: float, y: float, seen: Sequence[_Seen]) -> float:
+    rows = (row for one in seen for row in one.rows(x, y))
+    return sum(residual * residual / max(variance, 1e-12) for _, _, residual, variance in rows)
