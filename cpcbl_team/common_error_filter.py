@@ -91,6 +91,12 @@ class CommonErrorFilter:
         covariance = place_covariance(self._field, name)
         return with_common_errors(state, common.with_object(name, covariance))
 
+    def without_objects(self, state: State) -> State:
+        """The state of a robot that was wrong about its pose, and so about all places it found."""
+        common = state.common_errors
+        assert common is not None
+        return with_common_errors(state, common.without_objects())
+
     def has_no_place(self, state: State, name: str) -> bool:
         """Whether nobody has surveyed this landmark, and the robot does not know its place yet."""
         common = state.common_errors

@@ -117,6 +117,14 @@ class CommonErrors(NamedTuple):
         objects = {**self.objects, name: len(self.values)}
         return CommonErrors(self.axis_rad, (*self.values, x, y), parameters, objects)
 
+    def without_objects(self) -> "CommonErrors":
+        """With what is known of the camera alone."""
+        covariance, with_pose = self.parameters
+        rows = tuple(row[:CAMERA] for row in covariance[:CAMERA])
+        return CommonErrors(
+            self.axis_rad, self.values[:CAMERA], Parameters(rows, with_pose[:CAMERA])
+        )
+
     def corrected(self, sighting: Sighting) -> Sighting:
         """The sighting without the errors of the camera that are known."""
         return without_errors(sighting, self.errors, self.axis_rad)

@@ -14,6 +14,7 @@ from cpcbl_team.estimate import HEADING, POSE, POSITION, Estimate, Scope
 from cpcbl_team.fixes import PoseObservation, from_fix, from_position_sensor
 from cpcbl_team.fusion import chi_square_bounds, mark_shared
 from cpcbl_team.geometry import new
+from cpcbl_team.initial_pose import estimate_of
 from cpcbl_team.inputs import (
     Belief,
     BeliefShared,
@@ -61,6 +62,7 @@ from cpcbl_team.state import (
     with_uses,
 )
 from cpcbl_team.teammates import TeammateScreen
+from cpcbl_team.trusted_pose import agrees
 from cpcbl_team.variants import UpdateOrder, variant_of
 
 MOST_HEADING_SIGMA_RAD = math.radians(100.0)  # beyond, no bearing can be linearized
@@ -368,6 +370,9 @@ class Localizer:
     def set_pose(self, state: State, given: InitialPose) -> State:
         """Somebody says where the robot is: nothing is left of what it believed."""
         state = self.predict(state, given.stamp_ns)
+        was_wrong = not state.lost and not agrees(state.estimate, estimate_of(given))
+        if self._common is not None and was_wrong:
+            state = self._common.without_objects(state)
         return self.recovery.check(self.recovery.with_given_pose(state, given))
 
     def start(self, stamp_ns: int) -> State:

@@ -17,6 +17,7 @@ from cpcbl_team.estimate import (
     Information,
     Scope,
     Sums,
+    circle_variance,
     merge,
     with_circular_position,
 )
@@ -84,22 +85,30 @@ class JointVariant:
                 if found.measurement.is_for_heading:
                     within, estimate = HEADING, with_all_shared(estimate)
                 observation = found.observation.shifted(dx, dy, turn)
-                # The error of a place is the same at each sighting, whatever teammates send
-                merge_it = self._merge_teammate if found.measurement.is_teammate else merge_split
-                estimate = merge_it(estimate, observation, within)
+                estimate = self.observe(
+                    estimate, observation, within, found.measurement.is_teammate
+                )
         return self.reduce(estimate)
+
+    def observe(
+        self, prior: Estimate, observation: Observation, scope: Scope, by_teammate: bool = True
+    ) -> Estimate:
+        """The estimate after an observation with an error that it may contain already: that of a
+        teammate's pose, or of a place on the map, which is the same at each sighting."""
+        merge_it = self._merge_teammate if by_teammate else merge_split
+        return merge_it(prior, observation, scope)
 
     def correct_position(
         self, prior: Estimate, position: Observation, by_teammate: bool
     ) -> Estimate:
         """The estimate after a teammate, or the position sensor, observed the position."""
         if by_teammate:
-            return self._merge_teammate(prior, position, self.scope(POSITION))
+            return self.observe(prior, position, self.scope(POSITION))
         return merge(prior, position.information(), self.scope(POSITION))
 
     def correct_heading(self, prior: Estimate, heading: Observation) -> Estimate:
         """The estimate after a teammate observed the heading."""
-        return self._merge_teammate(prior, heading, self.scope(HEADING))
+        return self.observe(prior, heading, self.scope(HEADING))
 
 
 class OvalVariant(JointVariant):
@@ -161,6 +170,17 @@ class CircularVariant(OvalVariant):
         if self._uncoupled:
             return super().move(estimate, distance, turn, crawl_s, extra)
         return with_all_shared(move(estimate, distance, turn, self._noise, crawl_s, extra, True))
+
+    def observe(
+        self, prior: Estimate, observation: Observation, scope: Scope, by_teammate: bool = True
+    ) -> Estimate:
+        """Covariance intersection makes one axis shorter and the other one longer, and a circle is
+        as wide as the longer one. An object that is seen again and again would widen it for ever:
+        then it tells nothing."""
+        after = super().observe(prior, observation, scope, by_teammate)
+        before, now = prior.covariance.position(), after.covariance.position()
+        is_wider = circle_variance(*now) > circle_variance(*before)
+        return prior if is_wider and not by_teammate else after
 
     def merge(self, prior: Estimate, evidence: Sums, scope: Scope) -> Estimate:
         if self._uncoupled:
