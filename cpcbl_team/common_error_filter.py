@@ -120,7 +120,10 @@ class CommonErrorFilter:
         place, read = state.odometry_from_robot, (range_m, bearing)
         reading = LandmarkReading(now_ns, place, *read, *sighting_sigmas(sighting, self._sensor))
         memory = state.memory.calibration
-        readings = with_reading(memory.unplaced.get(name, ()), reading)
+        before = memory.unplaced.get(name, ())
+        readings = with_reading(before, reading)
+        if readings is before:
+            return state
         found = relative_place(readings, place)
         unplaced = {n: r for n, r in memory.unplaced.items() if n != name}
         if found is None:

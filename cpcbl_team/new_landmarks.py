@@ -15,8 +15,8 @@ from cpcbl_team.geometry import Pose2, wrap_angle
 from cpcbl_team.motion import drift_sigmas
 
 LEAST_READINGS: Final = 3  # one alone may have a wrong name
-MOST_READINGS: Final = 20
-SPACING_NS: Final = 200_000_000  # between two that are kept
+MOST_READINGS: Final = 12
+SPACING_NS: Final = 500_000_000  # between two that are kept
 WINDOW_NS: Final = 20_000_000_000
 LARGEST_SHARE: Final = 0.15  # sigma by distance: beyond, the place cannot be linearized
 RIVAL: Final = (
@@ -26,7 +26,7 @@ APART_SIGMAS: Final = 3.0
 FARTHEST_M: Final = 1000.0
 _DISTANCES_M: Final = (1.0, 3.0, 10.0)  # along a bearing without a range: a place is looked for
 _DIRECTIONS: Final = 8  # around a range without a bearing
-_ITERATIONS: Final = 15
+_ITERATIONS: Final = 10
 
 
 class LandmarkReading(NamedTuple):
@@ -43,11 +43,16 @@ class LandmarkReading(NamedTuple):
 def with_reading(
     readings: tuple[LandmarkReading, ...], reading: LandmarkReading
 ) -> tuple[LandmarkReading, ...]:
-    """The readings with one more, without what is too old; the same if it comes too soon."""
+    """The readings with one more, without what is too old; the same if it comes too soon. Of too
+    many the one goes that has the nearest neighbours in time, so that the others are far apart."""
     if readings and reading.stamp_ns - readings[-1].stamp_ns < SPACING_NS:
         return readings
-    young = [r for r in readings if reading.stamp_ns - r.stamp_ns <= WINDOW_NS]
-    return (*young[-MOST_READINGS + 1 :], reading)
+    kept = [r for r in readings if reading.stamp_ns - r.stamp_ns <= WINDOW_NS]
+    kept.append(reading)
+    if len(kept) > MOST_READINGS:
+        inner = range(1, len(kept) - 1)
+        del kept[min(inner, key=lambda i: kept[i + 1].stamp_ns - kept[i - 1].stamp_ns)]
+    return tuple(kept)
 
 
 def relative_place(
@@ -101,14 +106,13 @@ class _Seen:
 
 
 def _starts(seen: Sequence[_Seen]) -> Iterator[tuple[float, float]]:
-    """Places from which the best one is looked for: by the oldest and by the newest reading."""
-    for one in (seen[0], seen[-1]):
-        r, pose = one.reading, one.pose
-        turns = [2.0 * math.pi * k / _DIRECTIONS for k in range(_DIRECTIONS)]
-        bearings = turns if r.bearing_rad is None else [r.bearing_rad]
-        for distance in _DISTANCES_M if r.range_m is None else (r.range_m,):
-            for bearing in bearings:
-                yield pose.transform(distance * math.cos(bearing), distance * math.sin(bearing))
+    """Places from which the best one is looked for, by the newest reading."""
+    r, pose = seen[-1].reading, seen[-1].pose
+    turns = [2.0 * math.pi * k / _DIRECTIONS for k in range(_DIRECTIONS)]
+    bearings = turns if r.bearing_rad is None else [r.bearing_rad]
+    for distance in _DISTANCES_M if r.range_m is None else (r.range_m,):
+        for bearing in bearings:
+            yield pose.transform(distance * math.cos(bearing), distance * math.sin(bearing))
 
 
 def _fit(x: float, y: float, seen: Sequence[_Seen]) -> tuple[Gaussian2, float] | None:

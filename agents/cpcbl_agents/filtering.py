@@ -20,11 +20,12 @@ from cpcbl_team.inputs import (
 from cpcbl_team.localizer import Localizer
 from cpcbl_team.map_rejections import MISPLACED
 from cpcbl_team.miscalibration import percentages
+from cpcbl_team.places import map_object
 from cpcbl_team.self_calibration import SelfCalibration
 from cpcbl_team.sensors import recalibrated
 from cpcbl_team.timeline import Timeline
 from cpcbl_team.trust import TrustStatus, trust_statuses
-from cpcbl_transport.messages import input_name
+from cpcbl_transport.messages import Place, input_name
 
 REPORT_INTERVAL_NS = 100_000_000
 OFF_FIELD = "off_field"  # why a pose is not set
@@ -83,6 +84,19 @@ class FilterAgent:
         """What the robot has learned of its odometry and bearings; None where there is nothing."""
         known = self.timeline.state.memory.calibration.corrected
         return known if self._learns or known != SelfCalibration() else None
+
+    @property
+    def places(self) -> tuple[Place, ...]:
+        """The landmarks whose places the robot estimates beside its pose."""
+        common = self.timeline.state.common_errors
+        if common is None:
+            return ()
+        found = ((name, map_object(self._field, name, common)) for name in common.objects)
+        return tuple(
+            Place(name, p.position.x, p.position.y, p.position.covariance)
+            for name, p in found
+            if p is not None and p.wall is None
+        )
 
     def trust_statuses(self, now_ns: int) -> tuple[TrustStatus, ...]:
         """How far this robot trusts each teammate from which it receives help."""

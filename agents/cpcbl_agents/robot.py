@@ -197,6 +197,7 @@ class Robot:
             heard=received,
             spending=self.collaboration.budget.spending(now_ns),
             trust=tuple(self._trust(now_ns, clocks)),
+            places=self.filter.places,
         )
 
     def _trust(self, now_ns: int, clocks: ClockMonitor | None) -> Iterator[Trust]:

@@ -23,6 +23,7 @@ from cpcbl_team.inputs import InitialPose, Sighting, Sightings
 from cpcbl_team.localizer import Localizer
 from cpcbl_team.new_landmarks import (
     LEAST_READINGS,
+    MOST_READINGS,
     SPACING_NS,
     LandmarkReading,
     relative_place,
@@ -110,7 +111,8 @@ def test_readings_are_kept_apart_and_for_some_time() -> None:
     for r in readings(STRAIGHT):
         kept = with_reading(kept, r)
         assert with_reading(kept, r._replace(stamp_ns=r.stamp_ns + 1)) is kept
-    assert len(kept) == 20
+    assert len(kept) == MOST_READINGS
+    assert kept[0].stamp_ns == 0
     late = kept[-1]._replace(stamp_ns=kept[-1].stamp_ns + 60 * SECOND)
     assert with_reading(kept, late) == (late,)
 

@@ -113,6 +113,16 @@ class InputHealth(msgspec.Struct, frozen=True, array_like=True):
     """The median of arrival minus stamp lately; below zero the driver's clock is ahead."""
 
 
+class Place(msgspec.Struct, frozen=True, array_like=True):
+    """Where a robot takes a landmark to be whose place nobody has surveyed exactly: in the field's
+    frame (m), with the covariance xx, xy, yy (m^2)."""
+
+    landmark: str
+    x_m: float
+    y_m: float
+    covariance: tuple[float, float, float]
+
+
 class Status(msgspec.Struct, frozen=True, array_like=True, tag="status"):
     """A robot's health, for operators. Metres, radians, counts since its process started."""
 
@@ -141,6 +151,8 @@ class Status(msgspec.Struct, frozen=True, array_like=True, tag="status"):
     unconfirmed: str = ""
     """What is not confirmed about the pose, and why; the state is then not ok. Empty while the
     robot is lost."""
+    places: tuple[Place, ...] = ()
+    """The landmarks that the robot estimates beside its pose, as far as it has seen them."""
 
 
 class Track(msgspec.Struct, frozen=True, array_like=True, tag="track"):

@@ -93,6 +93,13 @@ def evaluate(
     unknown_starts: Annotated[
         bool, Option("--unknown-starts", help="Robots do not know where they start.")
     ] = False,
+    known_landmarks: Annotated[
+        str | None,
+        Option(
+            metavar="NAMES",
+            help="Landmarks whose places are known, e.g. 6,20 (or none); robots find the others.",
+        ),
+    ] = None,
     yardstick: Yardstick = None,
     export: ExportFolder = None,
     as_json: options.AsJson = False,
@@ -104,7 +111,7 @@ def evaluate(
     budgets = bytes_per_s, messages_per_minute, match_messages
     if len(words) == 1:
         changes = blind, variant, collaboration, fusion, direction, duration, *budgets
-        is_changed = any((*changes, unknown_starts, yardstick))
+        is_changed = any((*changes, unknown_starts, known_landmarks, yardstick))
         _evaluate_recording(words[0], is_changed, export, as_json)
         return
     team_file, data = _team_and_log(words)
@@ -119,6 +126,8 @@ def evaluate(
     logged = logged_team.with_duration(logged._replace(team=blind_team), duration)
     if unknown_starts:
         logged = logged_team.with_unknown_starts(logged)
+    known = None if known_landmarks is None else options.parse_names(known_landmarks)
+    logged = logged_team.with_known_landmarks(logged, [] if known == ["none"] else known)
     with progress_bar(f"{data.name}", quiet=as_json) as progress:
         result, paths = evaluate_log(
             logged,

@@ -36,7 +36,7 @@ from cpcbl_launch.reporting.metrics import ellipse_of
 from cpcbl_launch.reporting.recorded_file import CAMERAS
 from cpcbl_launch.reporting.statuses import current_help
 from cpcbl_team.config import Team
-from cpcbl_transport.messages import AnnotatedFrame, Message, Status, Track, Truths
+from cpcbl_transport.messages import AnnotatedFrame, Message, Place, Status, Track, Truths
 
 FIELD = "field"
 SCENE_NS, TRAIL_NS, TRUTH_NS = 200_000_000, 1_000_000_000, 100_000_000  # between two of a robot
@@ -158,6 +158,22 @@ class FoxgloveRun:
         ]
         if arrows:
             yield FoxgloveMessage("/help", SceneUpdate(entities=arrows))
+        if status.places:
+            found = [self._place_entity(at_ns, status.robot, place) for place in status.places]
+            at = f"/robots/{status.robot}/places"
+            yield FoxgloveMessage(at, SceneUpdate(entities=found))
+
+    def _place_entity(self, at_ns: int, robot: str, place: Place) -> SceneEntity:
+        """A disc of 3 sigma for a landmark that a robot finds itself."""
+        major, minor, turn = ellipse_of(*place.covariance)
+        colour, at = self._robot(robot).colour, (place.x_m, place.y_m)
+        return SceneEntity(
+            timestamp=_stamp(at_ns),
+            frame_id=FIELD,
+            id=f"landmark/{place.landmark}",
+            cylinders=[_disc(*at, 3.0 * major, 3.0 * minor, turn, 0.02, _colour(colour, 0.4))],
+            texts=[_text(place.landmark, *at, colour)],
+        )
 
     def _help_entity(self, at_ns: int, helper: str, helped: str, topic: str) -> SceneEntity | None:
         """A line with a head from a helper to the robot that it helps."""

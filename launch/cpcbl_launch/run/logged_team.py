@@ -2,6 +2,7 @@
 
 import math
 import re
+from collections.abc import Collection
 from pathlib import Path
 from typing import NamedTuple
 
@@ -12,7 +13,7 @@ from cpcbl_agents.sources import mrclam
 from cpcbl_launch.reporting.metrics import Floats, interpolated_truth
 from cpcbl_launch.team.file import builtin_path
 from cpcbl_launch.team.requirements import require_duration
-from cpcbl_team.config import Field, Start, Team
+from cpcbl_team.config import Field, Start, Team, Unsurveyed
 from cpcbl_team.errors import InputError
 from cpcbl_team.geometry import Pose2, step
 
@@ -78,7 +79,10 @@ def load_logged_team(team: Team, folder: Path) -> LoggedTeam:
         name: msgspec.structs.replace(team.robots[name], start=_start(folder, name, truth[name]))
         for name in names
     }
-    field = Field(landmarks=mrclam.read_landmarks(folder))
+    surveyed = mrclam.read_landmarks(folder)
+    unsurveyed = {name: mark for name, mark in team.map.unsurveyed.items() if name in surveyed}
+    known = {name: mark for name, mark in surveyed.items() if name not in unsurveyed}
+    field = Field(landmarks=known, unsurveyed=unsurveyed)
     ready = msgspec.structs.replace(team, robots=robots, map=field, data=str(folder.resolve()))
     start_ns = min(first for first, _ in spans.values())
     return LoggedTeam(ready, truth, left_out, start_ns, max(last for _, last in spans.values()))
@@ -90,6 +94,22 @@ def with_duration(logged: LoggedTeam, duration_s: float | None) -> LoggedTeam:
         return logged
     require_duration(duration_s, LEAST_S)
     return logged._replace(end_ns=min(logged.end_ns, logged.start_ns + int(duration_s * 1e9)))
+
+
+def with_known_landmarks(logged: LoggedTeam, names: Collection[str] | None) -> LoggedTeam:
+    """The same log, of whose landmarks only these are on the map (None: all); robots have to find
+    the others. Raises InputError for an unknown name."""
+    if names is None:
+        return logged
+    surveyed = logged.team.map.landmarks
+    if unknown := [name for name in names if name not in surveyed]:
+        raise InputError(
+            f"--known-landmarks: {unknown[0]}: no such landmark; there are {', '.join(surveyed)}"
+        )
+    known = {name: mark for name, mark in surveyed.items() if name in names}
+    unsurveyed = {name: Unsurveyed() for name in surveyed if name not in known}
+    field = Field(landmarks=known, unsurveyed=unsurveyed)
+    return logged._replace(team=msgspec.structs.replace(logged.team, map=field))
 
 
 def with_unknown_starts(logged: LoggedTeam) -> LoggedTeam:

@@ -108,6 +108,8 @@ def field(run: RunSummary, robots: Sequence[Drawn]) -> str:
         )
         if names:
             parts.append(text(at_x, at_y + 18, name, "soft", "middle"))
+    for robot in robots:
+        parts += _found_places(run, robot, x, y)
     taken: list[tuple[float, float]] = []
     for robot in robots:
         parts += _field_end(robot, x, y, taken)
@@ -116,6 +118,23 @@ def field(run: RunSummary, robots: Sequence[Drawn]) -> str:
     parts.append(f'<path class="scale" d="M12 {high - 12:.0f}v4h{length:.1f}v-4"/>')
     parts.append(text(18 + length, high - 8, f"{step:g} m", "soft"))
     return drawing(wide, high, parts, "Paths of the robots on the field", "field")
+
+
+def _found_places(run: RunSummary, robot: Drawn, x: Axis, y: Axis) -> Iterator[str]:
+    """The landmarks that a robot found itself, as it took them to be in the end, with 3 sigma."""
+    status = run.recorder.status.get(robot.path.name)
+    for place in () if status is None else status.places:
+        at_x, at_y = float(x.at(np.array(place.x_m))), float(y.at(np.array(place.y_m)))
+        major, minor, turn = ellipse_of(*place.covariance)
+        scale = abs(float(x.at(np.array(place.x_m + 1.0))) - at_x)
+        title = f"<title>{escape(place.landmark)}, found by {escape(robot.path.name)}</title>"
+        shape = f"M{at_x:.1f} {at_y - 5:.1f}l5 5-5 5-5-5z"
+        yield f'<path class="found {robot.colour}" d="{shape}">{title}</path>'
+        yield (
+            f'<ellipse class="found {robot.colour}" cx="{at_x:.1f}" cy="{at_y:.1f}"'
+            f' rx="{3 * major * scale:.1f}" ry="{3 * minor * scale:.1f}"'
+            f' transform="rotate({-math.degrees(turn):.1f} {at_x:.1f} {at_y:.1f})"/>'
+        )
 
 
 def _field_axes(run: RunSummary, robots: Sequence[Drawn]) -> tuple[Axis, Axis, float, float]:

@@ -13,6 +13,7 @@ from cpcbl_launch.views.traffic import LiveFlow, Traffic
 from cpcbl_launch.views.web.feed import LatestMessages, Snapshot, position_sigma_m
 from cpcbl_team.config import Field, Team
 from cpcbl_team.inputs import Sighting, SightingFault
+from cpcbl_transport import messages
 from cpcbl_transport.messages import Refusal, Truth
 
 SEEN_S = 1.0  # sightings older than this are not drawn
@@ -22,6 +23,8 @@ UNHEARD_S = 3.0  # so long after the connection the team should have been heard
 REFUSALS = frozenset([*Refusal, *SightingFault])
 
 Triple = tuple[float, float, float]
+Place = tuple[str, float, float, float, float, float]
+"""Name, x, y, semi-axes of one sigma, and the direction of the first."""
 Arrow = tuple[str, str, str, int, float | None]
 """Helper, helped, topic, tier of the helper, messages/s."""
 
@@ -42,6 +45,7 @@ class RobotPicture(msgspec.Struct, frozen=True, omit_defaults=True):
     tier: int | None = None
     truth: Triple | None = None
     sees: tuple[tuple[str, float | None, float | None], ...] = ()  # what, range, bearing
+    places: tuple[Place, ...] = ()  # of the landmarks that it finds itself
 
 
 class Frame(msgspec.Struct, frozen=True, tag="frame"):
@@ -180,6 +184,7 @@ def _picture(
         tier=None if status is None else status.tier,
         truth=None if there is None else _triple(*there),
         sees=seen if is_fresh else (),
+        places=() if status is None or state == "gone" else tuple(map(_place, status.places)),
     )
     if track is None:
         return common
@@ -268,6 +273,11 @@ def robot_detail(name: str, latest: LatestMessages, traffic: Traffic) -> RobotDe
         spending=live.spending,
         trust=live.trust,
     )
+
+
+def _place(place: messages.Place) -> Place:
+    x, y, _ = _triple(place.x_m, place.y_m, 0.0)
+    return place.landmark, x, y, *_triple(*ellipse_of(*place.covariance))
 
 
 def _round(value: float | None, digits: int = 3) -> float | None:

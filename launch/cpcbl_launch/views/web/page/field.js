@@ -96,6 +96,7 @@ export class FieldMap {
   frameAll() {
     const { landmarks, walls } = this.team;
     let points = landmarks.map(([, x, y]) => [x, y]);
+    for (const r of this.robots.values()) for (const [, x, y] of r.places ?? []) points.push([x, y]);
     for (const [, x1, y1, x2, y2] of walls) points.push([x1, y1], [x2, y2]);
     const box = (all) => [Math.min, Math.max].map((f) => [0, 1].map((i) => all.reduce((v, p) => f(v, p[i]), all[0][i])));
     const poses = [...this.robots.values()].filter((r) => r.pose).map((r) => r.pose);
@@ -150,6 +151,7 @@ export class FieldMap {
     this.isPlain = all.length > 60; // without what takes long to draw
     const strength = (r) => (!chosen || r.name === chosen ? 1 : 0.5);
     for (const r of all) this.drawTrail(r, strength(r));
+    for (const r of all) this.drawPlaces(r, strength(r));
     for (const r of all) this.drawEllipse(r, strength(r));
     for (const r of all) this.drawSightings(r, strength(r));
     for (const r of all) this.drawTruth(r);
@@ -250,6 +252,26 @@ export class FieldMap {
     c.stroke();
   }
 
+  // Landmarks that the robot finds itself, with the ellipses of 3 σ.
+  drawPlaces(r, strength) {
+    if (this.isCrowded && r.name !== this.team.chosen) return;
+    const c = this.context, isNamed = r.name === this.team.chosen || this.robots.size === 1;
+    c.strokeStyle = r.colour;
+    for (const [name, x, y, a, b, angle] of r.places ?? []) {
+      const [px, py] = this.pixels(x, y), size = 5, limit = 20 * (this.w + this.h);
+      c.globalAlpha = 0.9 * strength;
+      c.lineWidth = 1.5;
+      this.path([[px, py - size], [px + size, py], [px, py + size], [px - size, py], [px, py - size]]);
+      c.stroke();
+      c.globalAlpha = 0.5 * strength;
+      c.lineWidth = 1;
+      c.beginPath();
+      c.ellipse(px, py, Math.min(3 * a * this.scale, limit), Math.min(3 * b * this.scale, limit), -angle, 0, 2 * Math.PI);
+      c.stroke();
+      if (isNamed) this.text(name, px, py + 18, "center", 11, "soft");
+    }
+  }
+
   // A sighting without a range goes as far as what is seen; one without a bearing has no direction.
   drawSightings(r, strength) {
     if (this.isCrowded && r.name !== this.team.chosen) return;
@@ -274,7 +296,15 @@ export class FieldMap {
 
   placeOf(name) {
     const mark = this.team.landmarks.find((l) => l[0] === name);
-    return mark ? mark.slice(1) : this.robots.get(name)?.pose ?? null;
+    return mark ? mark.slice(1) : this.robots.get(name)?.pose ?? this.foundPlaceOf(name);
+  }
+
+  foundPlaceOf(name) {
+    for (const r of this.robots.values()) {
+      const found = r.places?.find((place) => place[0] === name);
+      if (found) return found.slice(1, 3);
+    }
+    return null;
   }
 
   drawTruth(r) {

@@ -77,7 +77,7 @@ function robot(name) {
 }
 
 // What the server leaves out has its default.
-const DEFAULTS = { severity: "good", why: "", is_guest: false, at_s: null, pose: null, ellipse: null, sigma_m: null, error_m: null, tier: null, truth: null, sees: [] };
+const DEFAULTS = { severity: "good", why: "", is_guest: false, at_s: null, pose: null, ellipse: null, sigma_m: null, error_m: null, tier: null, truth: null, sees: [], places: [] };
 
 function frame(message) {
   say({ ack: message.number });
