@@ -49,7 +49,7 @@ class OwnCalibration:
             rules.learns or rules.variant == "weighted" or rules.paper_uncertainty
         )
         # Of two that contradict each other either one may be wrong
-        self._names_misplaced = len(field.landmarks) + len(field.walls) > 2
+        self._names_misplaced = len(field.names) > 2
         self._names_of_landmarks = frozenset(field.landmarks)
         block_s = BLOCK_NS * 1e-9
         correlation_s, spacing_s = settings.sensor.correlation_s, SPACING_NS * 1e-9

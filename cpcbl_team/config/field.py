@@ -76,6 +76,11 @@ class Field(Table, frozen=True, kw_only=True):
         return frozenset((*self.landmarks, *self.walls, *self.unsurveyed))
 
     @property
+    def coloured(self) -> dict[str, Landmark | Unsurveyed]:
+        """All landmarks, those that nobody has surveyed too: what cylinders may stand for."""
+        return {**self.landmarks, **self.unsurveyed}
+
+    @property
     def gives_only_ranges(self) -> bool:
         """Whether there is something on the map, and no bearing of it is used."""
         gives = {mark.gives for mark in self.landmarks.values()}

@@ -12,6 +12,7 @@ from cpcbl_transport.messages import (
     Frame,
     InputHealth,
     Join,
+    Place,
     Pose,
     SimulatedRobotModel,
     Spending,
@@ -45,7 +46,10 @@ OLDER_STATUS = STATUS  # as the first releases sent it
 INPUTS = (InputHealth("odometry", 9.5, NOW, 7, {"too_late": 2}, 0.02),)
 STATUS = msgspec.structs.replace(STATUS, inputs=INPUTS, problems=("camera lost",))
 CONFIRMED_STATUS = STATUS  # as robots sent it that did not know of unconfirmed poses
-STATUS = msgspec.structs.replace(STATUS, unconfirmed="it stood")
+SURVEYED_STATUS = msgspec.structs.replace(STATUS, unconfirmed="it stood")
+"""As robots sent it that found no landmarks themselves."""
+PLACES = (Place("box", 2.0, 0.5, (0.01, 0.0, 0.02)),)
+STATUS = msgspec.structs.replace(SURVEYED_STATUS, places=PLACES)
 TRACK = Track("r1", NOW, 1.0, 2.0, 0.5, COVARIANCE, 3)
 ROWS = ((0.04, 0.01, 0.0), (0.01, 0.09, 0.0), (0.0, 0.0, 0.01))
 CONFIRMED_POSE = Pose("r1", NOW, 1.0, 2.0, 0.5, ROWS, "kidnapped")

@@ -158,6 +158,11 @@ def test_a_status_and_a_pose_without_unconfirmed_are_still_understood() -> None:
         assert decode_tagged(bytes.fromhex(GOLDEN[f"{name} without unconfirmed"])) == due
 
 
+def test_a_status_without_places_is_still_understood() -> None:
+    golden = bytes.fromhex(GOLDEN["status without places"])
+    assert decode_tagged(golden) == samples.SURVEYED_STATUS
+
+
 def test_a_status_without_inputs_is_still_understood() -> None:
     assert decode_tagged(bytes.fromhex(GOLDEN["status without inputs"])) == samples.OLDER_STATUS
 

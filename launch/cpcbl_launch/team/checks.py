@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 
 from cpcbl_launch.team.endpoints import endpoint_problem
+from cpcbl_launch.team.map_checks import map_problems, map_warnings
 from cpcbl_launch.team.ros2_checks import ros2_problems
 from cpcbl_launch.team.units import unit_warnings
 from cpcbl_team.config import LIKE_MIRRORED, MARKERS, Landmark, Team, Wall
@@ -14,12 +15,7 @@ def problems(team: Team) -> Iterator[str]:
     """The contradictions in a team, each as `key: problem; fix`."""
     if not team.robots:
         yield "robots: there is none; add a table [robots.r1]"
-    names = [*team.map.landmarks, *team.map.walls]
-    for twice in sorted({n for n in names if names.count(n) > 1 or n in team.robots}):
-        yield f"map: {twice!r} names two things; rename one of them"
-    for name, wall in team.map.walls.items():
-        if wall.from_m == wall.to_m:
-            yield f"map.walls.{name}: has no length; move to_m away from from_m"
+    yield from map_problems(team)
     for name, robot in team.robots.items():
         if robot.source == "simulated" and robot.start is None:
             yield f"robots.{name}.start: a simulated robot needs one; add x_m, y_m, heading_deg"
@@ -48,6 +44,7 @@ def warnings(team: Team) -> Iterator[str]:
     """What is no contradiction, but will disappoint, each as `key: what; fix`."""
     objects: list[Landmark | Wall] = [*team.map.landmarks.values(), *team.map.walls.values()]
     yield from unit_warnings(team)
+    yield from map_warnings(team)
     yield from _blind_team(team)
     readings = sum({"both": 2, "none": 0}.get(o.gives, 1) for o in objects)
     for name, robot in team.robots.items():
@@ -66,6 +63,8 @@ def warnings(team: Team) -> Iterator[str]:
                 f"robots.{name}.localizer.variant: {variant} never learns its heading from ranges"
                 " alone; use variant joint"
             )
+        if team.map.unsurveyed:
+            continue
         if len(objects) == 1:
             yield (
                 f"robots.{name}: one object on the map does not determine a pose; if the robot is"
@@ -84,8 +83,9 @@ def _blind_team(team: Team) -> Iterator[str]:
     if all(robot.source != "external" for robot in team.robots.values()):
         return  # a log has its own map, and a simulated team may be blind on purpose
     objects: list[Landmark | Wall] = [*team.map.landmarks.values(), *team.map.walls.values()]
-    useful = any(o.gives != "none" for o in objects)
-    coloured = any(mark.colours for mark in team.map.landmarks.values())
+    found = team.map.unsurveyed
+    useful = any(o.gives != "none" for o in (*objects, *found.values()))
+    coloured = any(mark.colours for mark in team.map.coloured.values())
     for robot in team.robots.values():
         seen = coloured if robot.sensing == "camera" else useful
         if robot.position_sensor is not None or (robot.sensor.sees_landmarks and seen):
@@ -102,6 +102,7 @@ def _vision_problems(team: Team) -> Iterator[str]:
     """Colours have thresholds, landmarks have bands of their own."""
     known = ", ".join(team.vision.colours)
     bands = {f"map.landmarks.{n}": m.colours for n, m in team.map.landmarks.items()}
+    bands |= {f"map.unsurveyed.{n}": m.colours for n, m in team.map.unsurveyed.items()}
     bands.update({f"robots.{n}": r.colours for n, r in team.robots.items()})
     for name, robot in team.robots.items():
         if robot.source == "simulated" and robot.camera.frames:
@@ -112,7 +113,7 @@ def _vision_problems(team: Team) -> Iterator[str]:
         if colours is not None and colours[0] == colours[1]:
             yield f"{key}.colours: both bands are {colours[0]}; use two colours"
     if team.cameras:
-        marks = [m.colours for m in team.map.landmarks.values() if m.colours is not None]
+        marks = [m.colours for m in team.map.coloured.values() if m.colours is not None]
         for twice in sorted({c for c in marks if marks.count(c) > 1}):
             yield f"map.landmarks: two have the colours {list(twice)}; give each its own"
 

@@ -16,7 +16,13 @@ from cpcbl_team.inputs import NAME_PATTERN
 DEEPEST = 12  # tables in tables; the settings need half of it
 LARGEST, SMALLEST = 1e6, 1e-9  # of numbers that are not 0: messages carry no larger ones
 LARGEST_AMOUNT = 2**40  # of bytes and messages
-NAMED = ("robots", "types", "map.landmarks", "map.walls")  # their names become part of keys
+NAMED = (
+    "robots",
+    "types",
+    "map.landmarks",
+    "map.unsurveyed",
+    "map.walls",
+)  # their names become part of keys
 _WORDS = {
     "object": "a table",
     "array": "a list",

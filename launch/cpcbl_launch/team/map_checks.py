@@ -1,0 +1,61 @@
+"""Checks of a team's map: what contradicts itself, and what will disappoint."""
+
+import math
+from collections.abc import Iterator
+
+from cpcbl_team.common_error_filter import considers_common_errors
+from cpcbl_team.config import Team
+
+LARGEST_SHARE = 0.25  # of the map's size, that its own errors may have
+
+
+def map_problems(team: Team) -> Iterator[str]:
+    """The contradictions in a map, each as `key: problem; fix`."""
+    names = [*team.map.landmarks, *team.map.unsurveyed, *team.map.walls]
+    for twice in sorted({n for n in names if names.count(n) > 1 or n in team.robots}):
+        yield f"map: {twice!r} names two things; rename one of them"
+    for name, wall in team.map.walls.items():
+        if wall.from_m == wall.to_m:
+            yield f"map.walls.{name}: has no length; move to_m away from from_m"
+    for name, mark in team.map.landmarks.items():
+        if mark.covariance_m2 is None:
+            continue
+        key, (xx, xy, yy) = f"map.landmarks.{name}.covariance_m2", mark.covariance_m2
+        if min(xx, yy) < 0.0 or xy * xy > xx * yy:
+            yield f"{key}: [{xx:g}, {xy:g}, {yy:g}] is no covariance; write xx, xy, yy in m^2"
+        elif mark.sigma_m:
+            yield f"{key}: there is sigma_m, too; remove one of the two"
+    simulated = [n for n, robot in team.robots.items() if robot.source == "simulated"]
+    for name, unsurveyed in team.map.unsurveyed.items():
+        if simulated and unsurveyed.true_m is None:
+            yield (
+                f"map.unsurveyed.{name}.true_m: the simulated field needs it; write where the"
+                " landmark stands, which no robot is told"
+            )
+
+
+def map_warnings(team: Team) -> Iterator[str]:
+    """What is no contradiction, but will disappoint, each as `key: what; fix`."""
+    x0, y0, x1, y1 = team.map.bounds()
+    size_m = math.hypot(x1 - x0, y1 - y0)
+    for name, mark in team.map.landmarks.items():
+        if mark.sigma_m > LARGEST_SHARE * size_m > 0.0:
+            yield (
+                f"map.landmarks.{name}.sigma_m: {mark.sigma_m:g} m is a large part of a map of"
+                f" {size_m:.1f} m; if it is in millimetres, write {1e-3 * mark.sigma_m:g}"
+            )
+    if not team.map.unsurveyed:
+        return
+    for name, robot in team.robots.items():
+        if robot.sensor.sees_landmarks and not considers_common_errors(robot):
+            yield (
+                f"robots.{name}.localizer.variant: {robot.localizer.variant} does not find"
+                " landmarks that nobody has surveyed; use variant joint"
+            )
+    has_frame = bool(team.map.landmarks or team.map.walls)
+    has_frame = has_frame or any(r.start or r.position_sensor for r in team.robots.values())
+    if not has_frame and all(robot.source != "mrclam" for robot in team.robots.values()):
+        yield (
+            "map.unsurveyed: no robot knows its start, and nothing else is on the map, so robots"
+            " stay lost; give a robot a start"
+        )

@@ -1,0 +1,92 @@
+"""What is said of a map that contradicts itself, or that will disappoint."""
+
+from typing import Any
+
+import pytest
+from msgspec.structs import replace
+
+from cpcbl_launch.team.checks import problems, warnings
+from cpcbl_team.config import (
+    Field,
+    Landmark,
+    LocalizerSettings,
+    RobotSettings,
+    Start,
+    Team,
+    Unsurveyed,
+    Wall,
+)
+
+CORNERS = {
+    "sw": Landmark(x_m=0.0, y_m=0.0),
+    "se": Landmark(x_m=6.0, y_m=0.0),
+    "ne": Landmark(x_m=6.0, y_m=4.0),
+}
+ROBOT = RobotSettings(source="external", start=Start(x_m=1.0, y_m=1.0))
+
+
+def team_of(robot: RobotSettings = ROBOT, **objects: Any) -> Team:
+    return Team(name="tests", map=Field(**({"landmarks": CORNERS} | objects)), robots={"r1": robot})
+
+
+@pytest.mark.parametrize(
+    ("objects", "begin", "end"),
+    [
+        ({"unsurveyed": {"sw": Unsurveyed()}}, "map: 'sw' names two things", "rename one of them"),
+        ({"unsurveyed": {"r1": Unsurveyed()}}, "map: 'r1' names two things", "rename one of them"),
+        (
+            {"landmarks": {"sw": Landmark(x_m=0.0, y_m=0.0, covariance_m2=(1.0, 2.0, 1.0))}},
+            "map.landmarks.sw.covariance_m2: [1, 2, 1] is no covariance",
+            "write xx, xy, yy in m^2",
+        ),
+        (
+            {
+                "landmarks": {
+                    "sw": Landmark(x_m=0.0, y_m=0.0, sigma_m=0.1, covariance_m2=(1.0, 0.0, 1.0))
+                }
+            },
+            "map.landmarks.sw.covariance_m2: there is sigma_m, too",
+            "remove one of the two",
+        ),
+        (
+            {"walls": {"w": Wall(from_m=(0.0, 0.0), to_m=(0.0, 0.0))}},
+            "map.walls.w: has no length",
+            "move to_m away from from_m",
+        ),
+    ],
+)
+def test_a_map_that_contradicts_itself_is_one_line(
+    objects: dict[str, Any], begin: str, end: str
+) -> None:
+    (line,) = problems(team_of(**objects))
+    assert line.startswith(begin)
+    assert line.endswith(end)
+
+
+def test_the_simulated_field_must_know_where_everything_stands() -> None:
+    simulated = replace(ROBOT, source="simulated")
+    (line,) = problems(team_of(simulated, unsurveyed={"box": Unsurveyed()}))
+    assert line.startswith("map.unsurveyed.box.true_m: the simulated field needs it")
+    known = team_of(simulated, unsurveyed={"box": Unsurveyed(true_m=(1.0, 2.0))})
+    assert list(problems(known)) == []
+    assert list(problems(team_of(unsurveyed={"box": Unsurveyed()}))) == []
+
+
+def test_only_joint_finds_landmarks() -> None:
+    oval = replace(ROBOT, localizer=LocalizerSettings(variant="oval"))
+    (line,) = warnings(team_of(oval, unsurveyed={"box": Unsurveyed()}))
+    assert line.startswith("robots.r1.localizer.variant: oval does not find landmarks")
+    assert list(warnings(team_of(unsurveyed={"box": Unsurveyed()}))) == []
+
+
+def test_a_map_from_nothing_needs_a_start() -> None:
+    nothing: dict[str, Any] = {"landmarks": {}, "unsurveyed": {"box": Unsurveyed()}}
+    assert list(warnings(team_of(**nothing))) == []
+    (line,) = warnings(team_of(replace(ROBOT, start=None), **nothing))
+    assert line.startswith("map.unsurveyed: no robot knows its start")
+
+
+def test_a_sigma_in_millimetres_is_said() -> None:
+    marks = CORNERS | {"ne": replace(CORNERS["ne"], sigma_m=20.0)}
+    lines = [line for line in warnings(team_of(landmarks=marks)) if "ne.sigma_m" in line]
+    assert any(line.endswith("write 0.02") for line in lines)
