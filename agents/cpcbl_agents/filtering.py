@@ -25,7 +25,7 @@ from cpcbl_team.self_calibration import SelfCalibration
 from cpcbl_team.sensors import recalibrated
 from cpcbl_team.timeline import Timeline
 from cpcbl_team.trust import TrustStatus, trust_statuses
-from cpcbl_transport.messages import Place, input_name
+from cpcbl_transport.messages import LandmarkEstimate, input_name
 
 REPORT_INTERVAL_NS = 100_000_000
 OFF_FIELD = "off_field"  # why a pose is not set
@@ -86,14 +86,14 @@ class FilterAgent:
         return known if self._learns or known != SelfCalibration() else None
 
     @property
-    def places(self) -> tuple[Place, ...]:
+    def places(self) -> tuple[LandmarkEstimate, ...]:
         """The landmarks whose places the robot estimates beside its pose."""
         common = self.timeline.state.common_errors
         if common is None:
             return ()
         found = ((name, map_object(self._field, name, common)) for name in common.objects)
         return tuple(
-            Place(name, p.position.x, p.position.y, p.position.covariance)
+            LandmarkEstimate(name, p.position.x, p.position.y, p.position.covariance)
             for name, p in found
             if p is not None and p.wall is None
         )

@@ -12,7 +12,7 @@ from cpcbl_transport.messages import (
     Frame,
     InputHealth,
     Join,
-    Place,
+    LandmarkEstimate,
     Pose,
     SimulatedRobotModel,
     Spending,
@@ -48,7 +48,7 @@ STATUS = msgspec.structs.replace(STATUS, inputs=INPUTS, problems=("camera lost",
 CONFIRMED_STATUS = STATUS  # as robots sent it that did not know of unconfirmed poses
 SURVEYED_STATUS = msgspec.structs.replace(STATUS, unconfirmed="it stood")
 """As robots sent it that found no landmarks themselves."""
-PLACES = (Place("box", 2.0, 0.5, (0.01, 0.0, 0.02)),)
+PLACES = (LandmarkEstimate("box", 2.0, 0.5, (0.01, 0.0, 0.02)),)
 STATUS = msgspec.structs.replace(SURVEYED_STATUS, places=PLACES)
 TRACK = Track("r1", NOW, 1.0, 2.0, 0.5, COVARIANCE, 3)
 ROWS = ((0.04, 0.01, 0.0), (0.01, 0.09, 0.0), (0.0, 0.0, 0.01))

@@ -113,7 +113,7 @@ class InputHealth(msgspec.Struct, frozen=True, array_like=True):
     """The median of arrival minus stamp lately; below zero the driver's clock is ahead."""
 
 
-class Place(msgspec.Struct, frozen=True, array_like=True):
+class LandmarkEstimate(msgspec.Struct, frozen=True, array_like=True):
     """Where a robot takes a landmark to be whose place nobody has surveyed exactly: in the field's
     frame (m), with the covariance xx, xy, yy (m^2)."""
 
@@ -151,7 +151,7 @@ class Status(msgspec.Struct, frozen=True, array_like=True, tag="status"):
     unconfirmed: str = ""
     """What is not confirmed about the pose, and why; the state is then not ok. Empty while the
     robot is lost."""
-    places: tuple[Place, ...] = ()
+    places: tuple[LandmarkEstimate, ...] = ()
     """The landmarks that the robot estimates beside its pose, as far as it has seen them."""
 
 

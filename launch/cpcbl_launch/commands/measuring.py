@@ -37,6 +37,16 @@ Fusion = Annotated[Literal["naive", "split-ci"] | None, Option(help="Fusion of a
 Direction = Annotated[
     Literal["one-way", "both-ways"] | None, Option(help="Direction of all robots.")
 ]
+UnknownStarts = Annotated[
+    bool, Option("--unknown-starts", help="Robots do not know where they start.")
+]
+KnownLandmarks = Annotated[
+    str | None,
+    Option(
+        metavar="NAMES",
+        help="Landmarks whose places are known, e.g. 6,20 (or none); robots find the others.",
+    ),
+]
 Yardstick = Annotated[
     Literal["ekf", "batch"] | None,
     Option(
@@ -90,16 +100,8 @@ def evaluate(
     messages_per_minute: options.MessagesPerMinute = None,
     match_messages: options.MatchMessages = None,
     duration: Annotated[float | None, Option(help="Seconds of the log; default: all.")] = None,
-    unknown_starts: Annotated[
-        bool, Option("--unknown-starts", help="Robots do not know where they start.")
-    ] = False,
-    known_landmarks: Annotated[
-        str | None,
-        Option(
-            metavar="NAMES",
-            help="Landmarks whose places are known, e.g. 6,20 (or none); robots find the others.",
-        ),
-    ] = None,
+    unknown_starts: UnknownStarts = False,
+    known_landmarks: KnownLandmarks = None,
     yardstick: Yardstick = None,
     export: ExportFolder = None,
     as_json: options.AsJson = False,

@@ -36,7 +36,14 @@ from cpcbl_launch.reporting.metrics import ellipse_of
 from cpcbl_launch.reporting.recorded_file import CAMERAS
 from cpcbl_launch.reporting.statuses import current_help
 from cpcbl_team.config import Team
-from cpcbl_transport.messages import AnnotatedFrame, Message, Place, Status, Track, Truths
+from cpcbl_transport.messages import (
+    AnnotatedFrame,
+    LandmarkEstimate,
+    Message,
+    Status,
+    Track,
+    Truths,
+)
 
 FIELD = "field"
 SCENE_NS, TRAIL_NS, TRUTH_NS = 200_000_000, 1_000_000_000, 100_000_000  # between two of a robot
@@ -163,7 +170,7 @@ class FoxgloveRun:
             at = f"/robots/{status.robot}/places"
             yield FoxgloveMessage(at, SceneUpdate(entities=found))
 
-    def _place_entity(self, at_ns: int, robot: str, place: Place) -> SceneEntity:
+    def _place_entity(self, at_ns: int, robot: str, place: LandmarkEstimate) -> SceneEntity:
         """A disc of 3 sigma for a landmark that a robot finds itself."""
         major, minor, turn = ellipse_of(*place.covariance)
         colour, at = self._robot(robot).colour, (place.x_m, place.y_m)

@@ -23,7 +23,7 @@ UNHEARD_S = 3.0  # so long after the connection the team should have been heard
 REFUSALS = frozenset([*Refusal, *SightingFault])
 
 Triple = tuple[float, float, float]
-Place = tuple[str, float, float, float, float, float]
+LandmarkPicture = tuple[str, float, float, float, float, float]
 """Name, x, y, semi-axes of one sigma, and the direction of the first."""
 Arrow = tuple[str, str, str, int, float | None]
 """Helper, helped, topic, tier of the helper, messages/s."""
@@ -45,7 +45,7 @@ class RobotPicture(msgspec.Struct, frozen=True, omit_defaults=True):
     tier: int | None = None
     truth: Triple | None = None
     sees: tuple[tuple[str, float | None, float | None], ...] = ()  # what, range, bearing
-    places: tuple[Place, ...] = ()  # of the landmarks that it finds itself
+    places: tuple[LandmarkPicture, ...] = ()  # of the landmarks that it finds itself
 
 
 class Frame(msgspec.Struct, frozen=True, tag="frame"):
@@ -275,7 +275,7 @@ def robot_detail(name: str, latest: LatestMessages, traffic: Traffic) -> RobotDe
     )
 
 
-def _place(place: messages.Place) -> Place:
+def _place(place: messages.LandmarkEstimate) -> LandmarkPicture:
     x, y, _ = _triple(place.x_m, place.y_m, 0.0)
     return place.landmark, x, y, *_triple(*ellipse_of(*place.covariance))
 
