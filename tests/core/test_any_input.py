@@ -3,6 +3,7 @@
 import math
 import random
 from collections.abc import Iterator
+from itertools import chain
 
 import pytest
 from msgspec.structs import replace
@@ -19,7 +20,15 @@ from support.core import (
     state_at,
 )
 
-from cpcbl_team.config import Field, Landmark, OdometrySettings, SensorSettings, Start, Variant
+from cpcbl_team.config import (
+    Field,
+    Landmark,
+    OdometrySettings,
+    SensorSettings,
+    Start,
+    Unsurveyed,
+    Variant,
+)
 from cpcbl_team.estimate import POSITION, Covariance3, Estimate, Information, merge
 from cpcbl_team.fixes import fix_for
 from cpcbl_team.geometry import Pose2
@@ -39,6 +48,9 @@ from cpcbl_team.timeline import Timeline
 ORIGIN = Pose2(0.0, 0.0, 0.0)
 STILL = OdometrySettings(moves=False)
 FAR = Field(landmarks={"near": Landmark(x_m=4.0, y_m=2.0), "far": Landmark(x_m=250.0, y_m=-90.0)})
+UNSURE = Field(
+    landmarks={"near": Landmark(x_m=4.0, y_m=2.0, sigma_m=0.3)}, unsurveyed={"far": Unsurveyed()}
+)
 probabilistic = pytest.mark.parametrize("variant", PROBABILISTIC)
 
 
@@ -47,6 +59,10 @@ def assert_sound(state: State) -> None:
     assert all(map(math.isfinite, (*estimate.pose, *estimate.covariance)))
     assert min(estimate.covariance.xx, estimate.covariance.yy, estimate.covariance.hh) >= 0.0
     assert estimate.position_sigma_m >= 0.0
+    if (common := state.common_errors) is not None:
+        covariance, with_pose = common.parameters
+        assert all(map(math.isfinite, (*common.values, *chain(*covariance, *with_pose))))
+        assert min(row[i] for i, row in enumerate(covariance)) >= 0.0
 
 
 def anything(rng: random.Random, count: int) -> Iterator[Input]:
@@ -92,10 +108,11 @@ def anything(rng: random.Random, count: int) -> Iterator[Input]:
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
+@pytest.mark.parametrize("field", [FAR, UNSURE], ids=["exact", "uncertain"])
 @pytest.mark.parametrize("seed", range(20))
-def test_any_history_leaves_a_covariance(variant: Variant, seed: int) -> None:
+def test_any_history_leaves_a_covariance(variant: Variant, field: Field, seed: int) -> None:
     rng = random.Random(seed)
-    robot = localizer(variant, FAR, start=Start(known=seed % 2 == 0, x_m=0.0, y_m=0.0))
+    robot = localizer(variant, field, start=Start(known=seed % 2 == 0, x_m=0.0, y_m=0.0))
     timeline = Timeline(robot, robot.start(0))
     for item in anything(rng, 60):
         timeline.add(item)
