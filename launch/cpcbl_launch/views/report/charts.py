@@ -20,6 +20,7 @@ from cpcbl_launch.views.report.svg import (
     rectangle,
     text,
 )
+from cpcbl_transport.messages import LandmarkEstimate
 
 WIDE, HIGH, NEES_HIGH = 460.0, 132.0, 74.0  # of a robot's drawing over time
 LEFT, RIGHT = 44.0, 8.0
@@ -122,8 +123,7 @@ def field(run: RunSummary, robots: Sequence[Drawn]) -> str:
 
 def _found_places(run: RunSummary, robot: Drawn, x: Axis, y: Axis) -> Iterator[str]:
     """The landmarks that a robot found itself, as it took them to be in the end, with 3 sigma."""
-    status = run.recorder.status.get(robot.path.name)
-    for place in () if status is None else status.places:
+    for place in _found(run, robot):
         at_x, at_y = float(x.at(np.array(place.x_m))), float(y.at(np.array(place.y_m)))
         major, minor, turn = ellipse_of(*place.covariance)
         scale = abs(float(x.at(np.array(place.x_m + 1.0))) - at_x)
@@ -137,10 +137,17 @@ def _found_places(run: RunSummary, robot: Drawn, x: Axis, y: Axis) -> Iterator[s
         )
 
 
+def _found(run: RunSummary, robot: Drawn) -> tuple[LandmarkEstimate, ...]:
+    status = run.recorder.status.get(robot.path.name)
+    return () if status is None else status.places
+
+
 def _field_axes(run: RunSummary, robots: Sequence[Drawn]) -> tuple[Axis, Axis, float, float]:
     """Of the map, and of nearly all that robots believed and that was true."""
     fixed = [(mark.x_m, mark.y_m) for mark in run.team.map.landmarks.values()]
     fixed += [end for wall in run.team.map.walls.values() for end in (wall.from_m, wall.to_m)]
+    for robot in robots:
+        fixed += [(found.x_m, found.y_m) for found in _found(run, robot)]
     moving = [np.empty((0, 2))]
     for robot in robots:
         known = robot.path.pose[~robot.path.is_lost, :2]
