@@ -26,8 +26,8 @@ from cpcbl_launch.views.report.charts import (
 
 FIELD_ABOUT = (
     "Solid: where a robot believed to be; red and dotted while it was lost; grey and dashed: where"
-    " it truly was. At its last pose, the 3 σ ellipse that it stated. Hollow diamonds: landmarks that"
-    " a robot estimated itself, with 3 σ."
+    " it truly was. At its last pose, the 3 σ ellipse that it stated. Hollow diamonds: landmarks"
+    " that a robot estimated itself, with 3 σ."
 )
 ROBOTS_ABOUT = (
     "Errors against the truth. Of a consistent estimate 98.9 % of the samples are inside 3 σ, and"
