@@ -76,8 +76,8 @@ class Field(Table, frozen=True, kw_only=True):
         return frozenset((*self.landmarks, *self.walls, *self.unsurveyed))
 
     @property
-    def coloured(self) -> dict[str, Landmark | Unsurveyed]:
-        """All landmarks, those that nobody has surveyed too: what cylinders may stand for."""
+    def all_landmarks(self) -> dict[str, Landmark | Unsurveyed]:
+        """All landmarks, those that nobody has surveyed too."""
         return {**self.landmarks, **self.unsurveyed}
 
     @property

@@ -25,7 +25,8 @@ class CameraCorrection:
 
     def __init__(self, robot: str, team: Team) -> None:
         settings: RobotSettings = team.robots[robot]
-        places = {name: (mark.x_m, mark.y_m) for name, mark in team.map.landmarks.items()}
+        exact = {name: mark for name, mark in team.map.landmarks.items() if mark.is_exact}
+        places = {name: (mark.x_m, mark.y_m) for name, mark in exact.items()}
         self._axis = math.radians(settings.camera.yaw_deg)
         start = settings.start
         if settings.odometry.moves or start is None or not start.known:

@@ -198,7 +198,7 @@ def known_cylinders(robot: str, team: Team, lens_m: float) -> dict[Bands, tuple[
     """The cylinders that a robot can detect, by colours: landmarks and teammates, not itself."""
     landmark = Shape.of(team.vision.landmark, lens_m)
     mast = Shape.of(team.vision.mast, lens_m, team.vision.marker_distance_m)
-    known = [(m.colours, landmark, name) for name, m in team.map.coloured.items()]
+    known = [(m.colours, landmark, name) for name, m in team.map.all_landmarks.items()]
     known += [(r.colours, mast, name) for name, r in team.robots.items() if name != robot]
     groups: dict[Bands, dict[Shape, list[str]]] = {}
     for bands, shape, name in known:

@@ -29,10 +29,13 @@ def check(file: options.Team) -> None:
         for warning in unit_warnings(rest) if rest else ():
             typer.echo(f"{file}: warning: {warning}", err=True)
         raise
-    marks, walls = len(team.map.landmarks), len(team.map.walls)
+    field = team.map
+    objects = [plural(len(field.landmarks), "landmark"), plural(len(field.walls), "wall")]
+    if field.unsurveyed:
+        objects.insert(1, f"{len(field.unsurveyed)} to be found")
     typer.echo(
         f"{file}: good: team {team.name!r}, {plural(len(team.robots), 'robot')}"
-        f" ({', '.join(team.robots)}), {plural(marks, 'landmark')}, {plural(walls, 'wall')}"
+        f" ({', '.join(team.robots)}), {', '.join(objects)}"
     )
     for warning in warnings(team):
         typer.echo(f"{file}: warning: {warning}", err=True)

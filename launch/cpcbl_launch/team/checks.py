@@ -85,7 +85,7 @@ def _blind_team(team: Team) -> Iterator[str]:
     objects: list[Landmark | Wall] = [*team.map.landmarks.values(), *team.map.walls.values()]
     found = team.map.unsurveyed
     useful = any(o.gives != "none" for o in (*objects, *found.values()))
-    coloured = any(mark.colours for mark in team.map.coloured.values())
+    coloured = any(mark.colours for mark in team.map.all_landmarks.values())
     for robot in team.robots.values():
         seen = coloured if robot.sensing == "camera" else useful
         if robot.position_sensor is not None or (robot.sensor.sees_landmarks and seen):
@@ -113,7 +113,7 @@ def _vision_problems(team: Team) -> Iterator[str]:
         if colours is not None and colours[0] == colours[1]:
             yield f"{key}.colours: both bands are {colours[0]}; use two colours"
     if team.cameras:
-        marks = [m.colours for m in team.map.coloured.values() if m.colours is not None]
+        marks = [m.colours for m in team.map.all_landmarks.values() if m.colours is not None]
         for twice in sorted({c for c in marks if marks.count(c) > 1}):
             yield f"map.landmarks: two have the colours {list(twice)}; give each its own"
 

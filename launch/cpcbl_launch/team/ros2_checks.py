@@ -68,8 +68,8 @@ def _tag_problems(team: Team, ros2: Ros2Settings) -> Iterator[str]:
     used: dict[int, str] = {}
     for name, tag in ros2.tags.items():
         key = f"ros2.tags.{name}"
-        if name not in team.map.landmarks:
-            near = nearest_name(name, team.map.landmarks)
+        if name not in team.map.all_landmarks:
+            near = nearest_name(name, team.map.all_landmarks)
             hint = f"did you mean {near!r}?" if near else "add it to map.landmarks"
             yield f"{key}: no landmark {name!r}; {hint}"
         if tag.id >= MARKERS[family]:

@@ -96,7 +96,7 @@ def with_change(inputs: RecordedInputs, change: Change) -> RecordedInputs:
 
 def _require(inputs: RecordedInputs, change: Change) -> None:
     robots = {*inputs.robots, *inputs.team.robots}
-    marks = {*inputs.team.map.landmarks, *inputs.team.map.walls}
+    marks = inputs.team.map.names
     for name in change.without:
         _require_known("--without", name, robots, "robot")
     for text in change.settings:

@@ -268,7 +268,10 @@ def ledger_changes(inputs: RecordedInputs) -> dict[tuple[str, str], Change | Non
     found: dict[tuple[str, str], Change | None] = {}
     if len(inputs.robots) > 1:
         found |= {("robot", name): Change(without=(name,)) for name in inputs.robots}
-    for kind, marks in (("landmark", inputs.team.map.landmarks), ("wall", inputs.team.map.walls)):
+    for kind, marks in (
+        ("landmark", inputs.team.map.all_landmarks),
+        ("wall", inputs.team.map.walls),
+    ):
         found |= {(kind, m): Change(hide=(m,)) if m in seen else None for m in marks}
     for robot, names in inputs_of.items():
         for name in SENSORS:

@@ -134,14 +134,14 @@ def robot_pictures(
     """All robots; `named` are those of the `team` file, all others are guests."""
     own = {} if team is None else team.robots
     unused = {name for name, robot in own.items() if not robot.sensor.sees_landmarks}
-    marks = () if team is None else (*team.map.landmarks, *team.map.walls)
+    marks = frozenset[str]() if team is None else team.map.names
     return {
         name: picture
         for name, latest in now.robots.items()
         if (
             picture := _picture(
                 latest,
-                marks if name in unused else (),
+                marks if name in unused else frozenset(),
                 now.truths.get(name),
                 bool(named) and name not in named,
                 now_s,
