@@ -23,7 +23,7 @@ from cpcbl_team.new_landmarks import LandmarkReading, relative_place, with_readi
 from cpcbl_team.parameters import Sensitivity, sensitivity_dot
 from cpcbl_team.places import EXACT, place_covariance
 from cpcbl_team.sensors import sighting_sigmas
-from cpcbl_team.state import State, with_common_errors, with_memory
+from cpcbl_team.state import State, with_common_errors, with_memory, with_uses
 
 _UNAFFECTED: tuple[Sensitivity, Sensitivity] = ((), ())
 
@@ -132,6 +132,9 @@ class CommonErrorFilter:
             if self._sensor.correlation_s > 0.0:  # many readings tell no more than one
                 found = found._replace(covariance=found.covariance.scaled(len(readings)))
             common = common.with_place(name, state.estimate, found)
+            updates = state.updates  # what comes next may err as these readings did
+            used = with_uses(updates.objects_ns, {name: state.stamp_ns})
+            state = state._replace(updates=updates._replace(objects_ns=used))
             memory = memory._replace(unplaced=unplaced, common=common)
         return with_memory(state, state.memory._replace(calibration=memory))
 

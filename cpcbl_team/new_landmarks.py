@@ -18,7 +18,7 @@ LEAST_READINGS: Final = 3  # one alone may have a wrong name
 MOST_READINGS: Final = 12
 SPACING_NS: Final = 500_000_000  # between two that are kept
 WINDOW_NS: Final = 20_000_000_000
-LARGEST_SHARE: Final = 0.15  # sigma by distance: beyond, the place cannot be linearized
+LARGEST_SHARE: Final = 0.1  # sigma by distance: beyond, the place cannot be linearized
 RIVAL: Final = (
     9.0  # another place whose chi-square is larger by less than this may be the right one
 )
