@@ -39,7 +39,7 @@ def builtin_for(folder: Path) -> Path:
 
 def file_for(team_file: Path, folder: Path) -> Path:
     """The team file for a log: `mrclam` is the built-in one that was not calibrated on it."""
-    is_name = team_file == Path("mrclam") and not team_file.exists()
+    is_name = team_file == Path("mrclam") and not team_file.is_file()
     return builtin_for(folder) if is_name else team_file
 
 
