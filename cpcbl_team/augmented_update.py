@@ -15,7 +15,7 @@ from cpcbl_team.estimate import (
 )
 from cpcbl_team.fusion import Observation, best_weight
 from cpcbl_team.gaussian import Covariance2
-from cpcbl_team.parameters import Numbers, Sensitivity, dot, sensitivity_dot
+from cpcbl_team.parameters import Numbers, Parameters, Sensitivity, dot, sensitivity_dot
 
 
 class Reading(NamedTuple):
@@ -90,7 +90,30 @@ class AugmentedUpdate:
         shared = ZERO3 if prior.shared is ZERO3 else self.covariance
         values = tuple([v + d for v, d in zip(self._common.values, self._changes, strict=True)])
         common = self._common._replace(values=values, parameters=self._parameters)
-        return Estimate(pose, self.covariance, shared), common
+        covariance = self.covariance
+        if common.found:
+            covariance, parameters = self._sheared(common.found)
+            common = common._replace(parameters=parameters)
+            shared = ZERO3 if prior.shared is ZERO3 else covariance
+        return Estimate(pose, covariance, shared), common
+
+    def _sheared(self, found: tuple[int, ...]) -> tuple[Covariance3, Parameters]:
+        """The covariances about the corrected pose and places.
+
+        A turn of the pose and of all that the robot has found about the origin changes no reading.
+        An error of the heading moves a place by the lever from there, so when a place is corrected
+        its covariance with the heading changes too. Else corrections would make certainty of the
+        heading, of which nothing is known (Huang, Mourikis & Roumeliotis, IJRR 29, 2010). This is
+        the right-invariant error of Barrau & Bonnabel (arXiv:1510.06263), to first order.
+        """
+        dx, dy, _ = self._offset
+        levers = [0.0] * len(self._changes)
+        for i in found:
+            levers[i], levers[i + 1] = -self._changes[i + 1], self._changes[i]
+        _, _, _, xh, yh, hh = self.covariance
+        parameters = self._parameters.sheared((-dy, dx), tuple(levers), (xh, yh, hh))
+        moved = 1.0, 0.0, -dy, 0.0, 1.0, dx, 0.0, 0.0, 1.0
+        return self.covariance.transformed(moved), parameters
 
 
 def estimated_of(common: CommonErrors, with_camera: bool) -> tuple[bool, ...]:

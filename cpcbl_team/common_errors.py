@@ -48,6 +48,7 @@ class CommonErrors(NamedTuple):
     values: Numbers  # of the camera: yaw (rad), focal length (logarithm); of each object: two
     parameters: Parameters
     objects: Mapping[str, int] = _NONE  # the number of the first parameter of each
+    found: tuple[int, ...] = ()  # those of objects whose places nobody has surveyed
 
     @staticmethod
     def of_camera(axis_rad: float, covariance: Covariance2) -> "CommonErrors":
@@ -92,7 +93,9 @@ class CommonErrors(NamedTuple):
         xx, xy, yy = covariance
         objects = {**self.objects, name: len(self.values)}
         parameters = self.parameters.with_more(((xx, xy), (xy, yy)))
-        return CommonErrors(self.axis_rad, (*self.values, 0.0, 0.0), parameters, objects)
+        return CommonErrors(
+            self.axis_rad, (*self.values, 0.0, 0.0), parameters, objects, self.found
+        )
 
     def with_place(self, name: str, own: Estimate, place: Gaussian2) -> "CommonErrors":
         """With an object that the robot has seen at this place in its own frame (m). Its parameters
@@ -114,8 +117,9 @@ class CommonErrors(NamedTuple):
         parameters = self.parameters.with_derived(
             ((xx, xy), (xy, yy)), tuple(of_pose), tuple(of_others)
         )
-        objects = {**self.objects, name: len(self.values)}
-        return CommonErrors(self.axis_rad, (*self.values, x, y), parameters, objects)
+        number = len(self.values)
+        objects, found = {**self.objects, name: number}, (*self.found, number)
+        return CommonErrors(self.axis_rad, (*self.values, x, y), parameters, objects, found)
 
     def without_objects(self) -> "CommonErrors":
         """With what is known of the camera alone."""

@@ -83,6 +83,26 @@ class Parameters(NamedTuple):
                 rows.append(tuple([b - k * (s - own) for b, s, own in parts]))
         return new(Parameters, (tuple(rows), self.with_pose))
 
+    def sheared(self, of_pose: tuple[float, float], of_each: Numbers, heading: Row) -> "Parameters":
+        """With errors that have grown by these factors (m) times the error of the heading; the
+        covariance of the pose with its heading is `heading`."""
+        (u, v), (x, y, variance) = of_pose, heading
+        with_heading = [g for _, _, g in self.with_pose]
+        rows = [
+            tuple(
+                [
+                    b + k * s + r * j + k * j * variance
+                    for b, s, j in zip(row, with_heading, of_each, strict=True)
+                ]
+            )
+            for row, r, k in zip(self.covariance, with_heading, of_each, strict=True)
+        ]
+        with_pose = []
+        for (a, b, g), k in zip(self.with_pose, of_each, strict=True):
+            a, b, g = a + k * x, b + k * y, g + k * variance
+            with_pose.append((a + u * g, b + v * g, g))
+        return Parameters(tuple(rows), tuple(with_pose))
+
     def with_more(self, covariance: tuple[Numbers, ...]) -> "Parameters":
         """With more parameters, of this covariance, that have nothing to do with the others."""
         n, m = len(self.with_pose), len(covariance)
