@@ -119,10 +119,17 @@ def test_readings_are_kept_apart_and_for_some_time() -> None:
 
 # In the filter -----------------------------------------------------------------------------------
 
+NEAR = Field(
+    landmarks={
+        n: replace(m, x_m=0.7 * m.x_m, y_m=0.7 * m.y_m) for n, m in CORNERS.landmarks.items()
+    }
+)
+"""The corners of a field that is so small that bearings alone determine places."""
+
 
 def unsurveyed(gives: Gives = "both") -> Field:
     """The corners, of which nobody knows the places."""
-    return Field(unsurveyed={name: Unsurveyed(gives=gives) for name in CORNERS.landmarks})
+    return Field(unsurveyed={name: Unsurveyed(gives=gives) for name in NEAR.landmarks})
 
 
 def mapping_robot(gives: Gives = "both", rules: LocalizerSettings | None = None) -> Localizer:
@@ -136,7 +143,7 @@ def mapped(robot: Localizer) -> tuple[State, Pose2]:
     state, truth = robot.start(0), LOOP_START
     for piece, truth in driven(LOOP_START, loop()):
         state = robot.add_odometry(state, piece)
-        state = robot.cycle(state, frame(truth, piece.stamp_ns, CORNERS))
+        state = robot.cycle(state, frame(truth, piece.stamp_ns, NEAR))
     return state, truth
 
 
@@ -145,10 +152,10 @@ def test_exact_readings_draw_the_exact_map(gives: Gives) -> None:
     state, truth = mapped(mapping_robot(gives))
     common = state.common_errors
     assert common is not None
-    assert gives != "both" or set(common.objects) == set(CORNERS.landmarks)
-    assert len(common.objects) >= 2
+    assert gives != "both" or set(common.objects) == set(NEAR.landmarks)
+    assert common.objects
     for name in common.objects:
-        mark = CORNERS.landmarks[name]
+        mark = NEAR.landmarks[name]
         assert common.place_error(name) == pytest.approx((mark.x_m, mark.y_m), abs=1e-3)
         assert max(common.place_covariance(name)[::2]) < 0.7**2
     assert position_error(state.estimate, truth) < 1e-3
@@ -171,7 +178,7 @@ def test_a_lost_robot_begins_no_landmark() -> None:
     state = robot.start(0)
     assert state.lost
     for k in range(1, 20):
-        state = robot.cycle(state, frame(LOOP_START, k * SECOND // 5, CORNERS))
+        state = robot.cycle(state, frame(LOOP_START, k * SECOND // 5, NEAR))
     assert state.common_errors is not None
     assert not state.common_errors.objects
 
@@ -188,7 +195,7 @@ def test_a_landmark_that_is_moved_is_named_and_moves_no_estimate() -> None:
     """After it was found: its readings are rejected, and the others keep the robot where it is."""
     robot = mapping_robot()
     state, truth = mapped(robot)
-    pushed = {**CORNERS.landmarks, "ne": replace(CORNERS.landmarks["ne"], x_m=6.5, y_m=0.5)}
+    pushed = {**NEAR.landmarks, "ne": replace(NEAR.landmarks["ne"], x_m=5.0, y_m=0.5)}
     worst, named = 0.0, set()
     for piece, pose in driven(truth, loop(), start_ns=state.stamp_ns):
         state = robot.add_odometry(state, piece)

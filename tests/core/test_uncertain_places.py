@@ -28,7 +28,7 @@ from support.core import (
     wall_sighting,
 )
 
-from cpcbl_team.augmented_update import AugmentedUpdate, Reading
+from cpcbl_team.augmented_update import AugmentedUpdate, Reading, estimated_of
 from cpcbl_team.common_error_filter import common_error_filter
 from cpcbl_team.common_errors import CommonErrors
 from cpcbl_team.config import (
@@ -279,3 +279,26 @@ def test_sigmas_of_sightings_come_from_where_the_object_is_taken_to_be() -> None
     assert not m.is_dependent
     expected = sighting_sigmas(seen, SETTINGS.sensor, math.hypot(4.0, 1.0))
     assert (m.range_sigma, m.bearing_sigma) == pytest.approx(expected)
+
+
+def test_a_turn_of_everything_stays_unknown_however_much_is_corrected() -> None:
+    """A robot and the landmarks that it found may all be turned about the origin: no reading tells.
+    So no update may make the variance along this turn smaller, wherever it moves the estimates."""
+    rng = np.random.default_rng(5)
+    pose, cov = Pose2(1.0, 2.0, 0.7), diagonal(1e-6, 0.2)
+    common = CommonErrors.of_camera(0.0, Covariance2(0.0, 0.0, 0.0))
+    estimate = Estimate(pose, cov)
+    for k in range(3):
+        place = Gaussian2(2.0 + k, 0.5 - k, Covariance2(0.04, 0.0, 0.04))
+        common = common.with_place(f"box{k}", estimate, place)
+    for _ in range(40):
+        update = AugmentedUpdate(estimate.covariance, common, estimated_of(common, False))
+        i = common.found[int(rng.integers(3))]
+        x, y = common.values[i : i + 2]
+        dx, dy = x - estimate.pose.x, y - estimate.pose.y
+        squared = dx * dx + dy * dy
+        u, v = -dy / squared, dx / squared  # how the heading that a bearing gives follows x and y
+        off = 0.2 * float(rng.normal())
+        update.add(Reading((u, v, 1.0), ((i, -u), (i + 1, -v)), off, 0.002))
+        estimate, common = update.result(estimate)
+        assert estimate.covariance.hh == pytest.approx(0.04, rel=2e-3)
