@@ -27,6 +27,7 @@ from cpcbl_team.miscalibration import (
 from cpcbl_team.range_errors import RangeEvidence
 from cpcbl_team.self_calibration import ReferencePoses, SelfCalibration
 from cpcbl_team.sender_records import SenderRecord
+from cpcbl_team.stationary_pose import StationaryRecord
 
 FIX = "fix:"  # marks the source of an active fix, apart from a sighting of that teammate
 _NONE: Mapping[str, Any] = MappingProxyType({})
@@ -167,6 +168,7 @@ class CalibrationMemory(NamedTuple):
     """What is known of the constant errors of the camera; None without a camera whose errors the
     filter considers."""
     residuals: MapResiduals = MapResiduals()
+    stationary: StationaryRecord | None = None  # None while it drives
 
     @property
     def corrected(self) -> SelfCalibration:
