@@ -69,7 +69,7 @@ class StationaryCheck:
         stamp_ns, _, place, _, _, _, (recovery, _, calibration, _) = state
         record = calibration.stationary
         if record is None:
-            return state if recovery.lost else self._begun(state, prior)
+            return state if recovery.lost else self._with_new_record(state, prior)
         if stamp_ns - record.used_ns < SPACING_NS:
             return state
         if recovery.lost:
@@ -77,7 +77,9 @@ class StationaryCheck:
         if is_stationary(record, prior, place):
             return None
         is_old = stamp_ns - record.checkpoints[-1].stamp_ns >= TEST_NS
-        return self._begun(state, prior) if is_old else state  # one that drives: once a second
+        return (
+            self._with_new_record(state, prior) if is_old else state
+        )  # one that drives: once a second
 
     def _observed(self, state: State, prior: Estimate, evidence: Sums) -> State:
         """The state after evidence of its own sensors about the offset from `prior`. Where all of
@@ -99,7 +101,7 @@ class StationaryCheck:
             state = with_recovery(state, memory).counted("lost")
         return _with_record(state, None)
 
-    def _begun(self, state: State, prior: Estimate) -> State:
+    def _with_new_record(self, state: State, prior: Estimate) -> State:
         return _with_record(state, started(state.stamp_ns, prior, state.odometry_from_robot))
 
 
