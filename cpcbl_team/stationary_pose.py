@@ -26,6 +26,8 @@ COMMON: Final = Covariance3(1e-4, 0.0, 1e-4, 0.0, 0.0, 3e-5)  # (1 cm)^2, (0.3 d
 VAGUE: Final = Covariance3(1.0, 0.0, 1.0, 0.0, 0.0, 4.0)
 """1/m^2, 1/rad^2: of an offset where its readings say nothing of it."""
 BEYOND: Final = 2.0  # a push may be so many times as far as what its own sensors notice of it
+LEAST_SHARE: Final = 1e-6  # of the largest information: what is less is rounding
+MOST_INFORMATION: Final = 1e12  # 1/m^2: beyond, what is new drowns in sums, which begin anew
 GROWN: Final = 1.01  # a variance that grows: something else made the robot doubt its pose
 
 
@@ -86,6 +88,8 @@ def observed(
     asked once a second."""
     reference = record.checkpoints[0].estimate.pose
     place, before, checkpoints, _ = record
+    if max(before[0]) > MOST_INFORMATION:
+        return started(stamp_ns, estimate, place), None
     total = _plus(before, evidence, _offset(reference, estimate.pose))
     newest = checkpoints[-1]
     if stamp_ns - newest.stamp_ns < TEST_NS:
@@ -149,9 +153,10 @@ def _mean(evidence: Sums, prior: Covariance3) -> tuple[Row, Covariance3]:
     """The offset that evidence says, from a pose with the covariance `prior`, and the covariance
     with which it is due. Where the evidence says nothing, the offset is zero and due to be."""
     matrix, vector = evidence
-    mean = VAGUE.plus(Covariance3(*matrix)).inverse()
+    least = LEAST_SHARE * max(matrix)
+    a, b, c = VAGUE.xx + least, VAGUE.yy + least, VAGUE.hh + least
+    mean = Covariance3(a, 0.0, b, 0.0, 0.0, c).plus(Covariance3(*matrix)).inverse()
     xx, xy, yy, xh, yh, hh = mean
-    a, b, c = VAGUE.xx, VAGUE.yy, VAGUE.hh
     # The share of an offset that the mean shows, (M + V)^-1 M, free of rounding where M is singular
     share = (
         1.0 - a * xx, -b * xy, -c * xh,

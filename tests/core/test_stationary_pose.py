@@ -201,6 +201,20 @@ def test_evidence_that_says_nothing_of_a_direction_is_no_contradiction_there() -
     assert found is not None
 
 
+@pytest.mark.parametrize("row", [(1.0, 0.0, 0.0), (0.6, -0.8, 0.0), (0.3, 0.2, 1.0)])
+def test_exact_sensors_do_not_drown_it_in_rounding(row: tuple[float, float, float]) -> None:
+    estimate = Estimate(ORIGIN, diagonal(0.02, 0.01))
+    record, exact = started(0, estimate, ORIGIN), Information.none()
+    for _ in range(100):
+        exact = exact.add(row, 1e-5, 1e-8)
+    numbers = []
+    for second in range(1, 500):
+        record, found = observed(record, second * SECOND, estimate, exact)
+        assert found is None
+        numbers.append(record.checkpoints[-1].number)
+    assert max(numbers) > numbers[-1]  # it began anew
+
+
 def test_what_is_kept_of_a_long_time_is_little() -> None:
     estimate = Estimate(ORIGIN, diagonal(0.1, 0.1))
     record, nothing = started(0, estimate, ORIGIN), Information.none()
