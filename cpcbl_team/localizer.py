@@ -61,6 +61,7 @@ from cpcbl_team.state import (
     with_teammates,
     with_uses,
 )
+from cpcbl_team.stationary_check import StationaryCheck
 from cpcbl_team.teammates import TeammateScreen
 from cpcbl_team.trusted_pose import agrees
 from cpcbl_team.variants import UpdateOrder, variant_of
@@ -97,6 +98,8 @@ class Localizer:
         self._calibration = OwnCalibration(settings, field, self._landmarks)
         parts = self._variant, self._calibration, self._common
         self._prediction = Prediction(settings, *parts)
+        has_common = self._common is not None or not field.is_exact
+        self._stationary = StationaryCheck(settings, self._variant.reduce, has_common)
         self.recovery = Recovery(settings, field, self._landmarks, self._variant.reduce)
         self.screen = TeammateScreen(settings, gates, self._variant.is_probabilistic, team)
 
@@ -115,11 +118,16 @@ class Localizer:
             gated = self.constrain(state.estimate, others, scope, state.common_errors)
         if self.screen.has_recent_reports(state, now):  # beyond the paper: trust
             state, gated = self.screen.screen_frame(state, landmarks, gated)
+        prior = state.estimate
         if self._common is None:
-            estimate = self.correct(state.estimate, landmarks, gated, scope)
+            estimate = self.correct(prior, landmarks, gated, scope)
         else:
             state, estimate = self._common.correct(state, gated.accepted)
-        return self.recovery.check(self._with_frame(state, estimate, landmarks, gated, scope))
+        state = self._with_frame(state, estimate, landmarks, gated, scope)
+        if self._stationary.is_active:
+            parts = prior, landmarks.evidence, gated.accepted
+            state = self._stationary.after_frame(state, *parts)
+        return self.recovery.check(state)
 
     # Step 1 -----------------------------------------------------------------------------------
 
@@ -287,7 +295,13 @@ class Localizer:
 
     def add_position(self, state: State, position: Position) -> State:
         """The robot's own position sensor: like a fix, but no teammate's error is in it."""
-        return self._observe_pose(state, position.stamp_ns, from_position_sensor(position))
+        before = self.predict(state, position.stamp_ns)
+        observation, prior = from_position_sensor(position), before.estimate
+        state = self._observe_pose(before, position.stamp_ns, observation)
+        if self._stationary.is_active and state.updates.accepted > before.updates.accepted:
+            evidence = observation.of_position(prior.pose).information()
+            state = self._stationary.after_position(state, prior, evidence)
+        return state
 
     def _observe_pose(self, state: State, stamp_ns: int, observation: PoseObservation) -> State:
         state = self._record_observation(self.predict(state, stamp_ns), observation)

@@ -10,7 +10,8 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Final, NamedTuple
 
 from cpcbl_team.config import Field, LocalizationSettings, LocalizerSettings
-from cpcbl_team.estimate import Covariance3, Estimate
+from cpcbl_team.estimate import Estimate
+from cpcbl_team.inflation import inflate_covariance
 from cpcbl_team.initial_pose import estimate_of
 from cpcbl_team.inputs import InitialPose
 from cpcbl_team.landmarks import Landmarks
@@ -37,7 +38,7 @@ from cpcbl_team.state import (
     with_common_errors,
     with_recovery,
 )
-from cpcbl_team.trust import forget_reports, reset_scores
+from cpcbl_team.trust import forget_reports, reset_scores, united_majority
 from cpcbl_team.trusted_pose import (
     agrees,
     expected_pose,
@@ -52,7 +53,6 @@ DOUBT_NS: Final = 5_000_000_000  # wrong inputs are named before they move a rob
 QUESTION_NS: Final = 2_000_000_000  # a suspicious robot asks so often whether it is elsewhere
 SUSPICIOUS: Final = 2  # of the last innovations rejected; of 20 that is 2 in 10 000 times
 UNCONFIRMED: Final = 3  # of them, for a robot to which nothing can tell that it is where it was
-_LEVER_M = 2.0  # over such a way an error of position has become one of heading
 
 
 # Being lost ---------------------------------------------------------------------------------------
@@ -97,42 +97,6 @@ def lost_reason(estimate: Estimate, innovations: int, limits: Limits) -> str:
     if rejected > most and length >= least:
         return f"{rejected} of the last {length} innovations rejected"
     return ""
-
-
-def inflate_covariance(estimate: Estimate, settings: LocalizerSettings) -> Estimate:
-    """For a robot that rejects what it measures: its sigmas double, so that its gates open. They
-    become 0.1 m and 0.1 rad at least, and the limits of being lost at most."""
-    c = estimate.covariance
-    position = 0.5 * (c.xx + c.yy)
-    position_goal = min(max(4.0 * position, 0.01), settings.lost_position_sigma_m**2)
-    heading_limit = 0.9 * math.radians(settings.lost_heading_sigma_deg)
-    heading_goal = min(max(4.0 * c.hh, 0.01), heading_limit**2)
-    p, h = max(position_goal - position, 0.0), max(heading_goal - c.hh, 0.0)
-    return estimate._replace(covariance=c.plus(Covariance3(p, 0.0, p, 0.0, 0.0, h)))
-
-
-def inflate_by_offset(
-    estimate: Estimate, offset_m: float, offset_rad: float, settings: LocalizerSettings
-) -> Estimate:
-    """For a robot that followed a teammate whose reports were wrong by these offsets: its own
-    estimate may be wrong by them."""
-    most_m = settings.lost_position_sigma_m
-    most_rad = 0.9 * math.radians(settings.lost_heading_sigma_deg)
-    turn = max(offset_m / _LEVER_M, offset_rad)
-    p, h = min(offset_m, most_m) ** 2, min(turn, most_rad) ** 2
-    grown = estimate.covariance.plus(Covariance3(p, 0.0, p, 0.0, 0.0, h))
-    return estimate._replace(covariance=grown)
-
-
-def inflate_to(estimate: Estimate, sigma_m: float, settings: LocalizerSettings) -> Estimate:
-    """For a robot whose teammates contradict each other: its position is no more certain than this
-    along any axis. What is added is shared, for it is an error of teammates."""
-    c, most_m = estimate.covariance, settings.lost_position_sigma_m
-    more = min(sigma_m, most_m) ** 2 - min(c.xx, c.yy)
-    if more <= 0.0:
-        return estimate
-    added = Covariance3(more, 0.0, more, 0.0, 0.0, 0.0)
-    return estimate._replace(covariance=c.plus(added), shared=estimate.shared.plus(added))
 
 
 def undetermined(
@@ -220,18 +184,22 @@ class Recovery:
             return state
         elif now - memory.suspected_ns > WINDOW_NS:
             return with_recovery(state, memory._replace(suspected_ns=-1, trusted=None))
-        if rejected_of(state.updates.innovations)[0] >= UNCONFIRMED and (
-            reason := self._unconfirmed(state, memory.suspected_ns)
+        for reason, since_ns in (
+            (self._unconfirmed(state, memory.suspected_ns), memory.suspected_ns),
+            (self._outnumbered(state), state.updates.accepted_ns),
         ):
-            memory = memory._replace(kidnapped_ns=memory.suspected_ns)
-            return self._recover(with_recovery(state, memory), reason)
+            if reason:
+                memory = memory._replace(kidnapped_ns=since_ns)
+                return self._recover(with_recovery(state, memory), reason)
         if now - max(memory.relocalization_ns, memory.suspected_ns + DOUBT_NS) < QUESTION_NS:
             return state
         evidence = self._evidence_since(state, memory.suspected_ns)
         own = tuple(e for e in evidence if not e.from_teammate)  # a liar must not move it
         memory = memory._replace(relocalization_ns=now)
         found = self._relocalized(state, own)
-        if found is None or agrees(state.estimate, found):
+        record = state.memory.calibration.stationary
+        stands = record is not None and record.checkpoints[0].stamp_ns <= memory.suspected_ns
+        if found is None or agrees(state.estimate, found, stands):
             return with_recovery(state, memory)
         if mistake := self._explaining_mistake(state, memory, found, own):
             return self._at_trusted_pose(state.counted("lost"), memory, mistake)
@@ -240,11 +208,24 @@ class Recovery:
     def _unconfirmed(self, state: State, since_ns: int) -> str:
         """Why nothing that a suspicious robot measures can confirm its pose: it is ranges to one
         object, which agree with any pose at that distance. Empty if something can."""
+        if rejected_of(state.updates.innovations)[0] < UNCONFIRMED:
+            return ""
         evidence = self._evidence_since(state, since_ns)
         is_determined = any(e.bearing_rad is not None or e.range_m is None for e in evidence)
         if is_determined or len({e.source for e in evidence}) != 1:
             return ""
         return undetermined(evidence, state.updates.objects_ns, since_ns)
+
+    def _outnumbered(self, state: State) -> str:
+        """Who shows a robot that sees only teammates that it is elsewhere: most of them, whose last
+        reports it rejected and which agree with each other. Empty if nobody does."""
+        if state.updates.innovations & (1 << UNCONFIRMED) - 1:
+            return ""
+        evidence = self._evidence_since(state, state.stamp_ns - WINDOW_NS)
+        names = united_majority(state.memory.teammates.senders, state.stamp_ns)
+        if not names or any(not e.from_teammate for e in evidence):
+            return ""
+        return f"{' and '.join(names)} contradict it, and agree"
 
     def _recover(self, state: State, reason: str) -> State:
         """The next state of a robot that is lost for this reason."""
@@ -325,6 +306,7 @@ class Recovery:
                 check=calibration.check.restarted(state.updates.accepted),
                 rejections=MapRejections(stamp_ns=state.stamp_ns, counted=state.updates.accepted),
                 residuals=NO_RESIDUALS,
+                stationary=None,
                 common=None if common is None else common.uncorrelated(),
             ),
         )

@@ -224,11 +224,7 @@ def _with_position(record: SenderRecord, now: ReportedPosition | None) -> Sender
         return replace(record, position=now)
     if now.stamp_ns <= then.stamp_ns:
         return record
-    displacement = then.odometry_from_robot.inverse() @ now.odometry_from_robot
-    driven = math.hypot(displacement.x, displacement.y)
-    reported = math.hypot(now.x - then.x, now.y - then.y)
-    slip = SLIP_SHARE * driven + SLIP_M
-    sigma = math.sqrt(then.variance + now.variance + slip * slip)
+    reported, driven, sigma = distances_between(then, now)
     is_far = driven >= max(LEAST_DISTANCE_M, (FROZEN_SIGMAS + 1.0) * sigma)
     jumped = reported - driven > JUMP_SIGMAS * sigma
     is_short = reported < FROZEN_SHARE * driven and driven - reported > FROZEN_SIGMAS * sigma
@@ -243,16 +239,27 @@ def _with_position(record: SenderRecord, now: ReportedPosition | None) -> Sender
         record = replace(record, missed_motion=missed_motion, last_failure_ns=at_ns)
         return replace(record, confirmations=0, agreements=0)
     if is_far:
-        record = replace(record, courses=_with_course(record.courses, then, now, displacement))
+        record = replace(record, courses=_with_course(record.courses, then, now))
     # While the robot stands, a frozen sender is right: that confirms nothing.
     confirms = is_far or record.reason is not QuarantineReason.FROZEN
     return replace(record, confirmations=record.confirmations + 1) if confirms else record
 
 
+def distances_between(then: ReportedPosition, now: ReportedPosition) -> tuple[float, float, float]:
+    """The distance between two reported positions, that by odometry, and the sigma of their
+    difference (m)."""
+    displacement = then.odometry_from_robot.inverse() @ now.odometry_from_robot
+    driven = math.hypot(displacement.x, displacement.y)
+    slip = SLIP_SHARE * driven + SLIP_M
+    sigma = math.sqrt(then.variance + now.variance + slip * slip)
+    return math.hypot(now.x - then.x, now.y - then.y), driven, sigma
+
+
 def _with_course(
-    courses: FadingTurns, then: ReportedPosition, now: ReportedPosition, displacement: Pose2
+    courses: FadingTurns, then: ReportedPosition, now: ReportedPosition
 ) -> FadingTurns:
     """The courses with the direction between two reported positions, beside that of odometry."""
+    displacement = then.odometry_from_robot.inverse() @ now.odometry_from_robot
     driven = math.hypot(displacement.x, displacement.y)
     by_odometry = then.odometry_from_robot.heading + math.atan2(displacement.y, displacement.x)
     reported = math.atan2(now.y - then.y, now.x - then.x)

@@ -28,6 +28,7 @@ from cpcbl_team.new_landmarks import LandmarkReading
 from cpcbl_team.range_errors import RangeEvidence
 from cpcbl_team.self_calibration import ReferencePoses, SelfCalibration
 from cpcbl_team.sender_records import SenderRecord
+from cpcbl_team.stationary_pose import StationaryRecord
 
 FIX = "fix:"  # marks the source of an active fix, apart from a sighting of that teammate
 _NONE: Mapping[str, Any] = MappingProxyType({})
@@ -170,6 +171,7 @@ class CalibrationMemory(NamedTuple):
     residuals: MapResiduals = MapResiduals()
     unplaced: Mapping[str, tuple[LandmarkReading, ...]] = _NONE
     """What was read of landmarks whose places are not known yet."""
+    stationary: StationaryRecord | None = None  # None while it drives
 
     @property
     def corrected(self) -> SelfCalibration:

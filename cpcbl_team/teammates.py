@@ -16,6 +16,7 @@ from cpcbl_team.estimate import Covariance3, Information, Sums
 from cpcbl_team.fixes import PoseObservation
 from cpcbl_team.fusion import Observation
 from cpcbl_team.gaussian import Covariance2
+from cpcbl_team.inflation import inflate_by_offset, inflate_to
 from cpcbl_team.inputs import Belief, Input, Position, Sightings
 from cpcbl_team.landmarks import LandmarkUpdate
 from cpcbl_team.mean_offsets import HEADING_VARIANCE, NOTHING, about_position
@@ -27,7 +28,6 @@ from cpcbl_team.measurements import (
     nearest_belief,
     observation_of,
 )
-from cpcbl_team.recovery import inflate_by_offset, inflate_to
 from cpcbl_team.recovery_evidence import without_senders
 from cpcbl_team.sender_comparisons import OWN_SENSORS, RECENT_NS, SenderRecords
 from cpcbl_team.sender_records import NEVER_NS, OffsetEvidence, ReportedPosition, TeammateReport

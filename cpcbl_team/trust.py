@@ -16,6 +16,7 @@ readmitted after its reports were right for some time (docs/trust.md).
 """
 
 import math
+from itertools import combinations
 from typing import Final, NamedTuple
 
 from msgspec.structs import replace
@@ -34,12 +35,15 @@ from cpcbl_team.sender_comparisons import (
 )
 from cpcbl_team.sender_records import (
     CONTRADICTING_NIS,
+    JUMP_SIGMAS,
     MOST_NIS,
     SILENCE_NS,
     OffsetEvidence,
     QuarantineReason,
+    ReportedPosition,
     SenderRecord,
     TeammateReport,
+    distances_between,
     quarantined,
     reason_of,
     released,
@@ -57,6 +61,7 @@ LEAST_CONFIRMATIONS = 2  # or distances that must agree with odometry
 PERSISTENCE_NS: Final = 500_000_000  # a mean that is wrong for so long is no chance
 ALIKE_M: Final = 0.05  # two senders whose offsets differ by no more, or by half of them, agree
 UNDECIDED_NS: Final = 10_000_000_000  # a dispute is undecided so long after a contest of its sides
+LEAST_UNITED: Final = 2  # teammates that agree with each other against the estimate
 MAJORITY_NS: Final = 20_000_000_000  # most senders are not found wrong within so short a time
 
 # The reasons that rest on what other senders reported
@@ -322,6 +327,31 @@ def _assess_quarantined(
     if not ((agrees and is_confirmed) or (is_alone and is_consistent)):
         return TrustDecision(senders, False)
     return TrustDecision({**senders, name: released(record, now)}, True, "readmitted")
+
+
+def united_majority(senders: SenderRecords, now_ns: int) -> tuple[str, ...]:
+    """The teammates that contradict the estimate since anybody last agreed with it, if they are
+    several, most of those that were heard lately, and agree with each other; else none."""
+    heard = {
+        n: r
+        for n, r in senders.items()
+        if n != OWN_SENSORS and not r.reason and now_ns - r.last_report_ns <= SILENCE_NS
+    }
+    agreed_ns = max((r.last_agreement_ns for r in senders.values()), default=now_ns)
+    against = {n: r for n, r in heard.items() if r.last_failure_ns > agreed_ns}
+    if len(against) < LEAST_UNITED or 2 * len(against) <= len(heard):
+        return ()
+    positions = [r.position for r in against.values() if r.position is not None]
+    since = [p for p in positions if p.stamp_ns > agreed_ns]
+    is_united = all(_agree(a, b) for a, b in combinations(since, 2))
+    return tuple(sorted(against)) if is_united else ()
+
+
+def _agree(one: ReportedPosition, other: ReportedPosition) -> bool:
+    """Whether two positions are as far from each other as the robot drove between them. (Where it
+    is elsewhere than it believes, so is its heading, and offsets from its estimate change.)"""
+    reported, driven, sigma = distances_between(one, other)
+    return abs(reported - driven) <= JUMP_SIGMAS * sigma
 
 
 def reset_scores(senders: SenderRecords) -> SenderRecords:

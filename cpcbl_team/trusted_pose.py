@@ -40,10 +40,10 @@ def expected_pose(state: State, memory: RecoveryMemory) -> Estimate:
     return propagated_pose(memory.trusted or trusted_pose(state), place)
 
 
-def agrees(estimate: Estimate, found: Estimate) -> bool:
+def agrees(estimate: Estimate, found: Estimate, stands: bool = False) -> bool:
     """Whether a pose from recent evidence is the estimate's, by the chi-square bound of 99.9 %; a
-    small difference may have other causes than a wrong pose."""
-    if not are_apart(estimate.pose, found.pose):
+    small difference may have other causes than a wrong pose, unless the robot `stands`."""
+    if not stands and not are_apart(estimate.pose, found.pose):
         return True
     information = estimate.covariance.plus(found.covariance).inverse()
     dx, dy = found.pose.x - estimate.pose.x, found.pose.y - estimate.pose.y

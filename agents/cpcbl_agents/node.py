@@ -132,7 +132,7 @@ class Node:
 
     @property
     def has_moved(self) -> bool:
-        """Whether the robot is no longer where it started, by its odometry."""
+        """Whether the robot is no longer where it started, by odometry or by where it was found."""
         return self._health.has_moved
 
     @property

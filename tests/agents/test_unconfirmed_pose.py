@@ -146,8 +146,10 @@ def test_a_pose_that_was_found_elsewhere_is_to_be_confirmed_again() -> None:
     still = STAND._replace(places=THREE, settings={}, start=Pose2(0.0, 0.0, 0.0))
     robot = DrivenRobot(still)
     robot.run(5.1)
+    assert not robot.node.has_moved
     robot.pose = Pose2(1.5, -1.0, 2.0)  # it is carried
     robot.run(20.0)
+    assert robot.node.has_moved  # a process that is started again does not begin at the start
     status = robot.statuses[-1]
     assert not status.lost
     assert "heading is not confirmed" in status.unconfirmed

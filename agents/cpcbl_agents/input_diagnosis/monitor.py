@@ -159,7 +159,7 @@ class InputMonitor:
         self.are_mended = self._are_wrong = False
         """Whether inputs were wrong before the last judgement, and are right."""
         self.has_moved = self.is_mistake_contradicted = False
-        """Whether odometry said so, at a judgement."""
+        """Whether odometry, or a pose that was found elsewhere, said so at a judgement."""
         wheels = settings.odometry
         self.inputs["odometry"].scales = wheels.distance_scale, wheels.turn_scale
         self._facts = InputFacts(
@@ -197,6 +197,9 @@ class InputMonitor:
             self._initial_pose = snapshot.initial_pose
             self._note_initial_pose(now_ns)
         self.has_moved |= abs(odometry.distance_m) > MOVED_M or abs(odometry.turn_rad) > TURNED_RAD
+        self.has_moved |= (
+            snapshot.jump is not None
+        )  # it was carried away, or never was at its start
         totals = self._totals(snapshot.refused, now_ns)
         if now_ns - self._start_ns >= SETTLED_NS:
             self._history.append(totals)
