@@ -108,6 +108,8 @@ class SensingAgent:
 
     @property
     def next_ns(self) -> int | None:
+        if not self._sources:
+            return None
         return min((s.next_ns for s in self._sources if s.next_ns is not None), default=None)
 
     @property

@@ -28,6 +28,14 @@ from fuzz.mutations import (
     mutated_tree,
     one_of,
 )
+from fuzz.replays import (
+    read_damaged_history,
+    read_damaged_state,
+    read_replayed,
+    write_damaged_state,
+    write_history,
+    write_replayed,
+)
 from fuzz.runs import read_merged, read_run, write_merged, write_run
 from mcap.writer import CompressionType, Writer
 from support.logs import log_team, write_log
@@ -299,4 +307,7 @@ KINDS: dict[str, tuple[Callable[[Path, random.Random], Path], Callable[[Path], N
     "picture": (write_picture, read_damaged_picture),
     "merged": (write_merged, read_merged),
     "run": (write_run, read_run),
+    "replayed": (write_replayed, read_replayed),
+    "state": (write_damaged_state, read_damaged_state),
+    "history": (write_history, read_damaged_history),
 }

@@ -24,7 +24,7 @@ MESSAGES = 80  # of a merged file that is written anew
 
 
 @cache
-def _run(folder: Path) -> Path:
+def whole_run(folder: Path) -> Path:
     """The folder of a whole run, with its merged file."""
     run = folder / "whole-run"
     record_run(run, load_team(builtin_path("demo")), 1, RECORDED_S, with_bus=True)
@@ -39,7 +39,7 @@ def _picture(data: bytes) -> bytes:
 
 def write_merged(folder: Path, rng: random.Random) -> Path:
     """A merged file with damaged bytes, or with damaged messages and schemas."""
-    path, whole = folder / "merged.mcap", _run(folder) / "run.mcap"
+    path, whole = folder / "merged.mcap", whole_run(folder) / "run.mcap"
     if rng.random() < 0.3:
         path.write_bytes(mutated_bytes(whole.read_bytes(), rng))
         return path
@@ -82,7 +82,7 @@ def read_merged(path: Path) -> None:
 
 def write_run(folder: Path, rng: random.Random) -> Path:
     """The folder of a run, in which one file is damaged, is foreign, or is missing."""
-    run, whole = folder / "run", _run(folder)
+    run, whole = folder / "run", whole_run(folder)
     shutil.rmtree(run, ignore_errors=True)
     shutil.copytree(whole, run)
     (run / "run.mcap").unlink()

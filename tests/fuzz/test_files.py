@@ -1,6 +1,6 @@
 """Every damaged file is used, or refused in one line: no traceback, no hang, no long line.
 
-`make fuzz` tries 70,000 files; `make test` a few hundred.
+`make fuzz` tries 100,000 files; `make test` a few hundred.
 """
 
 import json
@@ -33,6 +33,9 @@ FEW = {
     "picture": 300,
     "merged": 20,
     "run": 6,
+    "replayed": 20,
+    "state": 40,
+    "history": 20,
 }
 MANY = 10_000  # of each kind
 

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any, NamedTuple
 
-from cpcbl_agents import declarations, filtering, node
+from cpcbl_agents import collaboration, declarations, filtering, node, robot
 from cpcbl_launch.lab.luck import simulator
 from cpcbl_team import teammates, timeline
 from cpcbl_transport import budget
@@ -36,7 +36,7 @@ BUGS = {
     ),
     "late data": Bug(timeline.Timeline, "add", "key[0] < keys[-1][0] - self._horizon_ns", "False"),
     "subscriptions kept": Bug(declarations, "_declare", "declared.pop(key).close()", "pass"),
-    "refusal not counted": Bug(node.Node, "_handle_payload", "self.counts[message] += 1", "pass"),
+    "refusal not counted": Bug(node.Node, "_handle_payload", "self._counts[message] += 1", "pass"),
     "late not counted": Bug(filtering.FilterAgent, "_add", "self.counts[refusal] += 1", "pass"),
     "quarantine ignored": Bug(
         teammates.TeammateScreen, "_assess", "teammates), decision.trusted", "teammates), True"
@@ -46,6 +46,18 @@ BUGS = {
         "admits",
         "limit.room(now_ns, urgent) >= amount",
         "urgent or limit.room(now_ns, urgent) >= amount",
+    ),
+    "fresh budget": Bug(
+        robot.Robot,
+        "__init__",
+        "match = team.messages_per_s(name), restarted,",
+        "match = team.messages_per_s(name), False,",
+    ),
+    "free beliefs": Bug(
+        collaboration.CollaborationAgent,
+        "_record_sent",
+        "self._belief_sent_ns = message.stamp_ns",
+        "self._belief_sent_ns = message.stamp_ns; self.budget.refund(now_ns, sent.size)",
     ),
     "naive fusion": Bug(simulator, "team_of", "Settings(budget", "Settings(fusion='naive', budget"),
     "trust off": Bug(

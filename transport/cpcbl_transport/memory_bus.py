@@ -45,6 +45,8 @@ class _MemoryPublisher:
     def __init__(self, hub: MemoryHub, session: object, key: str) -> None:
         self._hub, self._session, self._key, self._open = hub, session, key, True
         self._patterns = patterns_of(key)
+        self._changes = -1  # of the subscribers, when these were found
+        self._found: list[_Subscriber] = []
 
     @property
     def matching(self) -> bool:
@@ -57,8 +59,12 @@ class _MemoryPublisher:
 
     def _others(self) -> list[_Subscriber]:
         """The subscribers of other sessions."""
-        found = self._hub.subscribers.find(self._patterns)
-        return [s for s in found if s.session is not self._session]
+        subscribers = self._hub.subscribers
+        if self._changes != subscribers.changes:
+            found = subscribers.find(self._patterns)
+            self._found = [s for s in found if s.session is not self._session]
+            self._changes = subscribers.changes
+        return self._found
 
     def close(self) -> None:
         self._open = False
@@ -122,16 +128,20 @@ class PatternIndex(Generic[Thing]):
     def __init__(self) -> None:
         self._things: dict[str, dict[int, Thing]] = {}
         self._numbers = count()
+        self.changes = 0
+        """How often something was added or taken back: what was found holds until then."""
 
     def add(self, patterns: Collection[str], thing: Thing) -> Callable[[], bool]:
         """Adds a thing. What it returns takes it back, and says whether it was there."""
         number = next(self._numbers)
+        self.changes += 1
         for pattern in patterns:
             self._things.setdefault(pattern, {})[number] = thing
         return partial(self._remove, patterns, number)
 
     def _remove(self, patterns: Collection[str], number: int) -> bool:
         was_there = False
+        self.changes += 1
         for pattern in patterns:
             here = self._things.get(pattern, {})
             was_there |= here.pop(number, None) is not None

@@ -9,7 +9,7 @@ import math
 from collections.abc import Iterable
 from enum import StrEnum
 from itertools import repeat
-from typing import Final
+from typing import Final, get_args
 
 import msgspec
 
@@ -253,6 +253,7 @@ Tagged = SensorInput | AnnotatedFrame | Status | Track | Pose | Drive | Join | T
 Message = Tagged | Help
 Outgoing = AnnotatedFrame | Track | Drive | Help  # what a robot sends besides its status
 Telemetry = Status | Track | Pose | Drive | Truths
+_TELEMETRY: Final = frozenset(get_args(Telemetry))  # a look-up is quicker than `isinstance`
 
 
 def input_name(message: SensorInput) -> str:
@@ -330,7 +331,7 @@ def refusal(message: Message, now_ns: int) -> Refusal | None:
         return Refusal.IMPLAUSIBLE if finite else Refusal.NOT_FINITE
     if abs(message.stamp_ns) >= LAST_NS:
         return Refusal.IMPLAUSIBLE
-    if isinstance(message, Telemetry) and _has_large_integer(message):
+    if type(message) in _TELEMETRY and _has_large_integer(message):
         return Refusal.IMPLAUSIBLE
     if message.stamp_ns > now_ns + FUTURE_NS:
         return Refusal.FUTURE

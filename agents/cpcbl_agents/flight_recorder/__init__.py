@@ -1,5 +1,7 @@
 """What a robot's process took and what came out of it, in files of its own (docs/recordings.md)."""
 
+import errno
+import logging
 import platform
 import re
 from collections.abc import Iterator
@@ -15,7 +17,7 @@ import cpcbl_agents
 import cpcbl_team
 import cpcbl_transport
 from cpcbl_agents.flight_recorder.entries import Header
-from cpcbl_agents.flight_recorder.recorder import FlightRecorder
+from cpcbl_agents.flight_recorder.recorder import FlightRecorder, StoppedRecorder
 from cpcbl_agents.flight_recorder.segments import SegmentWriter
 from cpcbl_agents.node import NodeStart
 from cpcbl_agents.robot import Robot
@@ -24,6 +26,9 @@ from cpcbl_team import landmarks
 from cpcbl_team.config import Team
 from cpcbl_team.errors import InputError
 
+log = logging.getLogger(__name__)
+
+NO_ROOM = errno.ENOSPC, errno.EDQUOT  # what a robot that is started again may find, too
 PACKAGES = cpcbl_team, cpcbl_transport, cpcbl_agents
 
 
@@ -31,13 +36,18 @@ PACKAGES = cpcbl_team, cpcbl_transport, cpcbl_agents
 def recorded(
     folder: Path, robot: Robot, team: Team, start: NodeStart, is_guest: bool = False
 ) -> Iterator[Tape]:
-    """The tape for the node of this robot, which records into the folder. Raises InputError."""
+    """The tape for the node of this robot, which records into the folder. Raises InputError where
+    that cannot be written to; a full disk keeps no robot from starting."""
     header = header_of(robot, team, start, is_guest)
     try:
         writer = SegmentWriter(folder, header, team.recording)
     except OSError as error:
         where = f"--record {folder}: {error.strerror or error}"
-        raise InputError(f"{where}; name a folder that can be written to") from error
+        if error.errno not in NO_ROOM:
+            raise InputError(f"{where}; name a folder that can be written to") from error
+        log.warning("%s: not recorded: %s", robot.name, where)
+        yield StoppedRecorder(f"not recorded: {error.strerror} ({folder})")
+        return
     with closing(FlightRecorder(writer, team.recording.images)) as recorder:
         yield recorder
 

@@ -138,6 +138,17 @@ class FlightRecorder(Tape):
         return _RecordedDetection(detection, self)
 
 
+class StoppedRecorder(Tape):
+    """The tape of a robot that cannot be recorded; its status says why."""
+
+    def __init__(self, problem: str) -> None:
+        self._problem = problem
+
+    @property
+    def problems(self) -> tuple[str, ...]:
+        return (self._problem,)
+
+
 class _RecordedArrivals(Arrivals):
     """Notes what is taken, when it is taken."""
 

@@ -39,8 +39,12 @@ class SegmentWriter:
         self._begun_s, self._is_next_due = time.monotonic(), False
         self._begins_at = 0  # the steps, in the present file
         self._stop = threading.Event()
+        self._thread: threading.Thread | None = None
         self._folder.mkdir(parents=True, exist_ok=True)
         self._file = self._begin_file()
+        self._start_thread()
+
+    def _start_thread(self) -> None:
         self._thread = threading.Thread(target=self._run, name="flight-recorder", daemon=True)
         self._thread.start()
 
@@ -63,7 +67,8 @@ class SegmentWriter:
     def close(self) -> None:
         """Writes what is left."""
         self._stop.set()
-        self._thread.join(PATIENCE_S)
+        if self._thread is not None:
+            self._thread.join(PATIENCE_S)
 
     def _give_up(self, reason: str) -> None:
         self.problem = f"no longer recorded: {reason} ({self._folder})"
@@ -75,16 +80,21 @@ class SegmentWriter:
         try:
             while not self.problem:
                 is_last = self._stop.wait(WRITE_S)
-                self._write()
+                self.write()
                 if is_last:
                     break
-        except OSError as error:
-            self._give_up(error.strerror or str(error))
         finally:
             if not self.problem and not self._stop.is_set():
                 self._give_up("an error of this program")
             with suppress(OSError):  # what is left in the buffer finds no room either
                 self._file.close()
+
+    def write(self) -> None:
+        """Writes what waits. A disk that takes no more ends the recording."""
+        try:
+            self._write()
+        except OSError as error:
+            self._give_up(error.strerror or str(error))
 
     def _write(self) -> None:
         steps: list[Step] = []
@@ -119,11 +129,16 @@ class SegmentWriter:
 
     def _begin_file(self) -> BinaryIO:
         name = f"{self._header.incarnation}-{self._header.segment:04}{SUFFIX}"
-        file = (self._folder / name).open("xb")
+        file = self._open(self._folder / name)
         self._begun_s = time.monotonic()
-        file.write(header_block(replace(self._header, began_unix_s=time.time())))
-        file.flush()
-        os.fsync(file.fileno())
+        try:
+            file.write(header_block(replace(self._header, began_unix_s=time.time())))
+            file.flush()
+            os.fsync(file.fileno())
+        except OSError:
+            with suppress(OSError):
+                file.close()
+            raise
         self._begins_at = file.tell()
         folder = os.open(self._folder, os.O_RDONLY)
         try:
@@ -131,6 +146,9 @@ class SegmentWriter:
         finally:
             os.close(folder)
         return file
+
+    def _open(self, path: Path) -> BinaryIO:
+        return path.open("xb")
 
     def _delete_oldest(self) -> None:
         """Keeps the files of this robot within the size that they may take together."""

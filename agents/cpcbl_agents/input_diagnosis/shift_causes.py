@@ -12,7 +12,7 @@ import cmath
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import pairwise
-from statistics import fmean, median
+from statistics import median
 from typing import NamedTuple
 
 from cpcbl_agents.input_diagnosis.motion_causes import (
@@ -245,11 +245,18 @@ def _point(
 ) -> Point:
     """One of several sightings. `share`: how far off the landmark is seen, of its range."""
     number = len(some)
-    place = complex(median(s[1].real for s in some), median(s[1].imag for s in some))
-    variance = 0.5 * (median(abs(s[0]) for s in some) * share) ** 2 + LEAST_SIGMA_M**2
+    place = complex(_median([s[1].real for s in some]), _median([s[1].imag for s in some]))
+    variance = 0.5 * (_median([abs(s[0]) for s in some]) * share) ** 2 + LEAST_SIGMA_M**2
     weight = (number * EFFICIENCY if number > 2 else number) / variance
-    robot = sum((s[2] for s in some), 0j) / number
-    return Point(name, place, robot, fmean(s[3] for s in some), passed, weight)
+    robot = sum([s[2] for s in some], 0j) / number
+    return Point(name, place, robot, math.fsum([s[3] for s in some]) / number, passed, weight)
+
+
+def _median(values: list[float]) -> float:
+    """That of `statistics`, which takes longer for the few values that there are."""
+    values.sort()
+    middle = len(values) // 2
+    return values[middle] if len(values) % 2 else (values[middle - 1] + values[middle]) / 2
 
 
 def _drift_rad(steps: Sequence[Step], wheels: OdometryNoise) -> float:
@@ -264,14 +271,15 @@ def _drift_rad(steps: Sequence[Step], wheels: OdometryNoise) -> float:
 def _fitted(points: Sequence[Point], unsure: _Unsure) -> tuple[Shift, float, int] | None:
     """The shift by least squares with weights against outliers; how large the errors are as a
     multiple of what is due, and how many points are no outliers."""
-    weights, sums = [p.weight for p in points], None
+    weights, sums, terms = [p.weight for p in points], None, _terms(points)
+    roots = [math.sqrt(w) for w in weights]
     scale, off = 1.0, list[float]()
     for _ in range(ROUNDS):
-        sums = _sums(points, weights)
+        sums = _sums(terms, weights)
         if sums is None:
             return None
         residuals = sums.residuals()
-        off = [abs(r) * math.sqrt(p.weight) for r, p in zip(residuals, points, strict=True)]
+        off = [abs(r) * root for r, root in zip(residuals, roots, strict=True)]
         scale = max(median(off) / 1.18, 0.3)  # of a Rayleigh distribution
         weights = [
             p.weight / (1.0 + (far / (CUT * scale)) ** 4)
@@ -340,28 +348,53 @@ class _Sums(NamedTuple):
         return Shift(g, 1.0 - e, sigma, inflation / self.xx, along, self.most_turn_rad)
 
 
-def _sums(points: Sequence[Point], weights: Sequence[float]) -> _Sums | None:
-    """None if the robot did not drive."""
+class _Terms(NamedTuple):
+    """What a fit needs of its points, whatever their weights are."""
+
+    q: Sequence[complex]
+    x: Sequence[complex]
+    z: Sequence[complex]
+    d: Sequence[complex]  # i q times the progress
+    of_landmarks: Sequence[Sequence[int]]  # which points are of the same one
+    most_turn_rad: float
+
+
+def _terms(points: Sequence[Point]) -> _Terms:
     middle = median(p.heading for p in points)
-    q, x = [p.place for p in points], [p.robot for p in points]
-    z = [1j * (p.heading - middle) * p.place for p in points]
-    d = [1j * p.progress * p.place for p in points]
-    by_name: dict[str, list[int]] = {}
-    for i, p in enumerate(points):
-        by_name.setdefault(p.name, []).append(i)
-    for own in by_name.values():
-        total = sum(weights[i] for i in own)
-        for values in (q, x, z, d):
-            mean = sum((weights[i] * values[i] for i in own), 0j) / total
-            for i in own:
-                values[i] -= mean
-    xx = sum(w * abs(a) ** 2 for w, a in zip(weights, x, strict=True))
+    names = dict.fromkeys(p.name for p in points)
+    return _Terms(
+        q=[p.place for p in points],
+        x=[p.robot for p in points],
+        z=[1j * (p.heading - middle) * p.place for p in points],
+        d=[1j * p.progress * p.place for p in points],
+        of_landmarks=[[i for i, p in enumerate(points) if p.name == n] for n in names],
+        most_turn_rad=max(abs(p.heading - middle) for p in points),
+    )
+
+
+def _sums(terms: _Terms, weights: Sequence[float]) -> _Sums | None:
+    """None if the robot did not drive."""
+    q, x, z, d = (_centred(v, weights, terms.of_landmarks) for v in terms[:4])
+    xx = sum([w * abs(a) ** 2 for w, a in zip(weights, x, strict=True)])
     if xx <= 0.0:
         return None
-    zz = sum(w * abs(c) ** 2 for w, c in zip(weights, z, strict=True)) + TURN_SIGMA**-2
-    xz = sum((w * a.conjugate() * c for w, a, c in zip(weights, x, z, strict=True)), 0j)
-    xq = sum((w * a.conjugate() * b for w, a, b in zip(weights, x, q, strict=True)), 0j)
-    xd = sum((w * a.conjugate() * c for w, a, c in zip(weights, x, d, strict=True)), 0j)
-    zq = sum((w * c.conjugate() * b).real for w, c, b in zip(weights, z, q, strict=True))
-    most = max(abs(p.heading - middle) for p in points)
-    return _Sums(q, x, z, xx, zz, xz, xq, zq, xd, most)
+    zz = sum([w * abs(c) ** 2 for w, c in zip(weights, z, strict=True)]) + TURN_SIGMA**-2
+    wx = [w * a.conjugate() for w, a in zip(weights, x, strict=True)]
+    xz = sum([a * c for a, c in zip(wx, z, strict=True)], 0j)
+    xq = sum([a * b for a, b in zip(wx, q, strict=True)], 0j)
+    xd = sum([a * c for a, c in zip(wx, d, strict=True)], 0j)
+    zq = sum([(w * c.conjugate() * b).real for w, c, b in zip(weights, z, q, strict=True)])
+    return _Sums(q, x, z, xx, zz, xz, xq, zq, xd, terms.most_turn_rad)
+
+
+def _centred(
+    values: Sequence[complex], weights: Sequence[float], of_landmarks: Sequence[Sequence[int]]
+) -> list[complex]:
+    """The values, each less the weighted mean of its landmark."""
+    centred = list(values)
+    for own in of_landmarks:
+        total = sum([weights[i] for i in own])
+        mean = sum([weights[i] * values[i] for i in own], 0j) / total
+        for i in own:
+            centred[i] -= mean
+    return centred

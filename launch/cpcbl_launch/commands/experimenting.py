@@ -174,8 +174,8 @@ def luck(
     from rich.console import Console
 
     from cpcbl_launch.lab.luck import sweep as luck
-    from cpcbl_launch.lab.luck.history import read_history
     from cpcbl_launch.lab.luck.outcome import run_history
+    from cpcbl_launch.lab.luck.plan import read_history
     from cpcbl_launch.views.run import progress_bar
 
     options.require_folder("--output", output)

@@ -27,6 +27,10 @@ if TYPE_CHECKING:
 ANSWER_S = 10.0  # for a scheduler to answer
 LOOK_S = 5.0  # between two looks whether there are workers
 PROGRAM = "cpcbl-team"
+NO_CERTIFICATE = (
+    "needs a certificate of the client and its authority: set"
+    " DASK_DISTRIBUTED__COMM__TLS__CA_FILE, __CLIENT__CERT and __CLIENT__KEY (docs/recordings.md)"
+)
 Result = TypeVar("Result")
 
 
@@ -74,6 +78,8 @@ def _cluster(address: str) -> "Iterator[Client]":
         raise DependencyError(f"--cluster {address} needs Dask: {install_command('cluster')}")
     from distributed import Client
 
+    if address.startswith("tls://") and not _has_certificate():
+        raise InputError(f"--cluster {address}: {NO_CERTIFICATE}")
     try:
         client = Client(address, timeout=ANSWER_S, set_as_default=False)  # type: ignore[no-untyped-call]
     except (OSError, TypeError, ValueError, ImportError) as error:
@@ -83,6 +89,13 @@ def _cluster(address: str) -> "Iterator[Client]":
         if problem := _workers_problem(client):
             raise InputError(f"--cluster {address}: {problem}")
         yield client
+
+
+def _has_certificate() -> bool:
+    """Whether Dask's settings have what the client needs for encrypted links."""
+    from dask import config
+
+    return all(config.get(f"distributed.comm.tls.{name}") for name in ("ca-file", "client.cert"))
 
 
 def _workers_problem(client: "Client") -> str:

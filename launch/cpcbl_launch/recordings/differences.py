@@ -17,6 +17,7 @@ from cpcbl_agents.flight_recorder.entries import (
     TokenTaken,
     Undeclared,
 )
+from cpcbl_launch.team.faults import one_line
 from cpcbl_transport.decoding import decode_by_key
 from cpcbl_transport.messages import Refusal
 
@@ -37,10 +38,11 @@ class Difference(msgspec.Struct, frozen=True, kw_only=True):
     new: str
 
     def __str__(self) -> str:
-        field = f", {self.field}" if self.field else ""
+        field = f", {one_line(self.field)}" if self.field else ""
+        after, what, old, new = map(one_line, (self.after, self.what, self.old, self.new))
         return (
             f"{self.robot} ({self.incarnation}), step {self.step} at {self.at_s:.3f} s, after"
-            f" {self.after}: {self.what}{field}: was {self.old}, is {self.new}"
+            f" {after}: {what}{field}: was {old}, is {new}"
         )
 
 

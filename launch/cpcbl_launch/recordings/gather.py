@@ -66,10 +66,9 @@ def gather(run: Path, is_wanted: Callable[[str], bool] = lambda key: True) -> Ga
         remarks += heard.remarks
         sources.append(heard.messages)
     has_looks = found.bus is not None
-    sources += [_of_process(process, remarks, has_looks) for process in processes]
+    sources += [_of_process(process, remarks, has_looks, is_wanted) for process in processes]
     first = processes[0]
-    wanted = (recorded for recorded in _merged(sources) if is_wanted(recorded.key))
-    return Gathered(first.team, first.header.version, wanted, remarks)
+    return Gathered(first.team, first.header.version, _merged(sources), remarks)
 
 
 def _of_file(path: Path, is_wanted: Callable[[str], bool]) -> Gathered:
@@ -95,10 +94,14 @@ def _merged(sources: Sequence[Iterator[Recorded]]) -> Iterator[Recorded]:
         yield recorded
 
 
-def _of_process(process: Process, remarks: list[str], has_looks: bool) -> Iterator[Recorded]:
+def _of_process(
+    process: Process, remarks: list[str], has_looks: bool, is_wanted: Callable[[str], bool]
+) -> Iterator[Recorded]:
     for step in process.steps(remarks):
         for entry in step.entries:
             for key, payload in _payloads(process.robot, entry, has_looks):
+                if not is_wanted(key):
+                    continue
                 message = decode(key, payload)
                 if isinstance(message, Refusal | Frame):
                     continue

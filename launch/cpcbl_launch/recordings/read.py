@@ -20,6 +20,7 @@ from cpcbl_launch.team.file import decode_resolved
 from cpcbl_team.config import Team
 
 BUS = Path("bus.mcap")  # what was heard on the bus, beside the robots' folders
+LONGEST_NAME = 200
 
 
 class Segment(NamedTuple):
@@ -113,6 +114,10 @@ def read_run(folder: Path) -> Run:
         except DamageError as error:
             _add(damage, path, f"{error.reason} (byte {error.offset})")
         else:
+            named = header.robot, header.incarnation, header.version
+            if not all(text.isprintable() and len(text) <= LONGEST_NAME for text in named):
+                _add(damage, path, "its header has no name of a robot, a process or a version")
+                continue
             segments.setdefault((header.robot, header.incarnation), []).append(
                 Segment(path, header)
             )

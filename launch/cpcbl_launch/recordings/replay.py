@@ -22,6 +22,8 @@ from cpcbl_launch.recordings.state_files import NodeState
 from cpcbl_launch.team.faults import one_line
 from cpcbl_team.errors import CpcblError, InputError
 
+MOST_STEPS = 2**62  # of a process: any number that fits
+
 
 class Replayed(msgspec.Struct, frozen=True, kw_only=True):
     """What a replay of one process found."""
@@ -81,6 +83,8 @@ class Replay:
         self._steps = process.steps(self.damage)
         if state is not None:
             state.require_process(header.robot, header.incarnation)
+            if not header.first_step - 1 <= state.step < MOST_STEPS:
+                raise LogError(f"{state.where}: the state after a step that is not recorded")
             for _ in islice(self._steps, state.step + 1 - header.first_step):
                 pass
             self.now_ns, self.number = state.now_ns, state.step
@@ -109,8 +113,8 @@ class Replay:
     def _restored(self, state: bytes, version: str, where: str) -> Node:
         if version != program_version():
             raise LogError(
-                f"{where}: a state of version {version}, this is {program_version()}: replay it"
-                " with that version, or from the start of the process"
+                f"{where}: a state of version {one_line(version, 80)}, this is {program_version()}:"
+                " replay it with that version, or from the start of the process"
             )
         try:
             node = self.playback.restored(state)

@@ -6,6 +6,7 @@ from pathlib import Path
 import msgspec
 
 from cpcbl_agents.sources.mrclam import LogError
+from cpcbl_launch.team.faults import one_line
 from cpcbl_team.errors import InputError
 
 MAGIC = b"cpcbl-state 1\n"
@@ -27,7 +28,9 @@ class NodeState(msgspec.Struct, frozen=True, kw_only=True):
         """Raises LogError for another process."""
         if (self.robot, self.incarnation) != (robot, incarnation):
             own = f"{self.robot}/{self.incarnation}"
-            raise LogError(f"{self.where}: the state of {own}, not of {robot}/{incarnation}")
+            raise LogError(
+                f"{self.where}: the state of {one_line(own, 80)}, not of {robot}/{incarnation}"
+            )
 
 
 def write_state(path: Path, state: NodeState) -> None:
@@ -53,5 +56,7 @@ def read_state(path: Path) -> NodeState:
         unpacker = zlib.decompressobj()
         state = msgspec.msgpack.decode(unpacker.decompress(packed, LARGEST), type=NodeState)
     except (zlib.error, msgspec.MsgspecError) as error:
-        raise LogError(f"--from {path}: no state that `replay --dump` wrote: {error}") from error
+        raise LogError(
+            f"--from {path}: no state that `replay --dump` wrote: {one_line(str(error))}"
+        ) from error
     return msgspec.structs.replace(state, where=f"--from {path}")

@@ -1,13 +1,10 @@
 """A history of bad luck: a team, a seed and events. Plain data, a small file, and sentences."""
 
 from collections.abc import Iterable
-from pathlib import Path
 from typing import Literal
 
 import msgspec
 from msgspec.structs import replace
-
-from cpcbl_team.errors import InputError
 
 Kind = Literal[
     "loss",
@@ -31,6 +28,7 @@ Kind = Literal[
     "liar",
     "dark",
     "kidnap",
+    "disk-full",
 ]
 SENTENCES: dict[Kind, str] = {
     "loss": "{robot} loses {strength:.0%} of the help that it sends and receives",
@@ -54,6 +52,7 @@ SENTENCES: dict[Kind, str] = {
     "liar": "the help of {robot} is wrong by {strength:.1f} m",
     "dark": "no robot sees a landmark",
     "kidnap": "{robot} is carried {strength:.1f} m away",
+    "disk-full": "the disk is full on which {robot} is recorded",
 }
 INSTANT: tuple[Kind, ...] = ("kidnap",)
 
@@ -98,16 +97,6 @@ class History(msgspec.Struct, frozen=True):
         """What happens, for people."""
         first = f"A team of {', '.join(self.robots)} (seed {self.seed}) for {self.duration_s:g} s."
         return [first, *(str(event) for event in sorted(self.events, key=lambda e: e.from_s))]
-
-
-def read_history(path: Path) -> History:
-    """The history in a file. Raises InputError."""
-    try:
-        return msgspec.json.decode(path.read_bytes(), type=History)
-    except OSError as error:
-        raise InputError(f"--replay {path}: {error.strerror}") from error
-    except (msgspec.MsgspecError, UnicodeDecodeError) as error:
-        raise InputError(f"--replay {path}: not a history: {error}") from error
 
 
 def history_text(history: History) -> bytes:

@@ -7,14 +7,14 @@ from cpcbl_launch.lab.luck.network import Network
 from cpcbl_team.config import Team
 from cpcbl_team.inputs import Sighting, Sightings
 from cpcbl_transport import topics
-from cpcbl_transport.bus import Handle
+from cpcbl_transport.bus import Handle, Publisher
 from cpcbl_transport.messages import encode
 from cpcbl_transport.topics import Qos
 
 EVERY_NS = 100_000_000
 BURSTS: dict[Kind, int] = {"garbage": 10, "token-flood": 3, "odd-sightings": 1, "flood": 400}
 """How many messages a member sends at a time, ten times a second."""
-MOST_TOKENS = 40
+MOST_TOKENS, MOST_PUBLISHERS = 40, 100
 
 
 class Member:
@@ -23,6 +23,7 @@ class Member:
     def __init__(self, event: Event, network: Network, team: Team) -> None:
         self._event, self._network, self._team = event, network, team
         self._is_over, self._tokens = False, list[Handle]()
+        self._publishers: dict[str, Publisher] = {}
         self._bus = network.session(f"member{event.number}")
         self._dice = network.dice(event)
 
@@ -31,9 +32,7 @@ class Member:
             return
         for _ in range(BURSTS[self._event.kind]):
             key, payload = _message(self._event, self._dice, self._team)
-            publisher = self._bus.publisher(key, Qos.FRESH)
-            publisher.put(payload)
-            publisher.close()
+            self._publisher(key).put(payload)
         if self._event.kind == "token-flood":
             self._declare_token()
         self._network.at(self._network.now_ns + EVERY_NS, self.begin)
@@ -41,6 +40,14 @@ class Member:
     def end(self) -> None:
         self._is_over = True
         self._bus.close()
+
+    def _publisher(self, key: str) -> Publisher:
+        """The publisher of a key; the oldest is closed where there are many, of ever new names."""
+        if key not in self._publishers:
+            if len(self._publishers) >= MOST_PUBLISHERS:
+                self._publishers.pop(next(iter(self._publishers))).close()
+            self._publishers[key] = self._bus.publisher(key, Qos.FRESH)
+        return self._publishers[key]
 
     def _declare_token(self) -> None:
         tier, name = self._dice.randrange(16), _name(self._dice)

@@ -113,7 +113,10 @@ class Network:
 
     def carry(self, receiver: str, key: str, arrive: Callable[[], None]) -> None:
         """Carries a message of the present sender; each copy arrives at its time."""
-        for delay_ns in self._delays_ns(self.sender, receiver, key) if self._active else (0,):
+        if not self._active:
+            arrive()
+            return
+        for delay_ns in self._delays_ns(self.sender, receiver, key):
             if delay_ns:
                 self.at(self.now_ns + delay_ns, arrive)
             else:
@@ -231,7 +234,8 @@ class _Publisher(PublisherProxy):
 
     @property
     def matching(self) -> bool:
-        return self._publisher.matching and self._session.reaches_any(self._key)
+        is_cut = self._session.network.has_cuts
+        return self._publisher.matching and (not is_cut or self._session.reaches_any(self._key))
 
     def put(self, payload: bytes) -> None:
         network, own = self._session.network, self._session.name
@@ -262,7 +266,7 @@ class _Session(BusProxy):
     def reaches_any(self, key: str) -> bool:
         """Whether a subscriber is on this side of the cuts."""
         network, patterns = self.network, patterns_of(key)
-        return not network.has_cuts or any(
+        return any(
             network.sees(self.name, other) is not False
             for other, declared in network.declared.items()
             if other != self.name and any(k in patterns for k in declared["subscriptions"])

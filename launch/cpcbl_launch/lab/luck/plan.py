@@ -1,12 +1,18 @@
-"""Which history a seed makes. Pure functions of the seed."""
+"""Which history a seed makes, and which one a file holds."""
 
+from pathlib import Path
 from random import Random
 
+import msgspec
+
 from cpcbl_launch.lab.luck.history import INSTANT, Event, History, Kind
-from cpcbl_launch.lab.luck.teams import GUESTS, team_of
+from cpcbl_launch.lab.luck.teams import GUESTS, OBSERVER, team_of
+from cpcbl_launch.team.faults import one_line
+from cpcbl_team.errors import InputError
 
 DURATION_S, QUIET_S, FIRST_S = 60.0, 25.0, 6.0
 """A history's length, the time without events at its end, and when the first event may begin."""
+LONGEST_S = 86_400.0  # of a history in a file
 EVERY_S = (0.5, 4.0)
 LASTS_S = (1.0, 8.0)
 STRENGTHS: dict[Kind, tuple[float, float]] = {
@@ -42,6 +48,7 @@ WEIGHTS: dict[Kind, int] = {
     "liar": 1,
     "dark": 2,
     "kidnap": 1,
+    "disk-full": 1,
 }
 
 
@@ -64,3 +71,37 @@ def history_of(seed: int, duration_s: float = DURATION_S) -> History:
             events.append(event)
         at_s += dice.uniform(*EVERY_S)
     return History(seed, duration_s, robots, tuple(events))
+
+
+def read_history(path: Path) -> History:
+    """The history in a file. Raises InputError."""
+    try:
+        history = msgspec.json.decode(path.read_bytes(), type=History)
+    except OSError as error:
+        raise InputError(f"--replay {path}: {error.strerror}") from error
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
+        raise InputError(f"--replay {path}: not a history: {one_line(str(error))}") from error
+    if problem := _problem(history):
+        raise InputError(f"--replay {path}: not a history of this version: {problem}")
+    return history
+
+
+def _problem(history: History) -> str:
+    """Why a history cannot be run; empty if it can."""
+    known = tuple(team_of(history.seed).robots)
+    if set(history.robots) - set(known) or len(set(history.robots)) < len(history.robots):
+        return f"its robots are not those of its seed: {', '.join(known)}"
+    if OBSERVER not in history.robots:
+        return f"it lacks the robot {OBSERVER}"
+    if not 0.0 < history.duration_s <= LONGEST_S:
+        return f"duration_s must be above 0 and at most {LONGEST_S:g}"
+    for event in history.events:
+        lowest, highest = STRENGTHS.get(event.kind, (0.0, 0.0))
+        targets = {"guest": GUESTS, "dark": ("",)}.get(event.kind, (*known, ""))
+        if event.robot not in targets:
+            return f"{event.kind} cannot happen to {event.robot!r:.40}"
+        if not 0.0 <= event.from_s <= event.until_s <= LONGEST_S:
+            return f"{event.kind} must begin after the start, and before it ends"
+        if not min(lowest, 0.0) <= event.strength <= highest:
+            return f"{event.kind} has a strength from {lowest:g} to {highest:g}"
+    return ""

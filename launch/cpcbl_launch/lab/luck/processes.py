@@ -9,6 +9,8 @@ from cpcbl_agents.earlier_processes import EarlierRuns
 from cpcbl_agents.node import GuestNode, Node, NodeCallbacks, NodeStart
 from cpcbl_agents.process import MAX_CLOCK_STEP_S, make_robot
 from cpcbl_agents.robot import NEVER_NS, build_robot
+from cpcbl_agents.tape import NO_TAPE
+from cpcbl_launch.lab.luck.disks import Disk
 from cpcbl_launch.lab.luck.network import Network
 from cpcbl_launch.lab.luck.witness import Report, Witness
 from cpcbl_launch.simulation.field import SimulatedField
@@ -28,6 +30,8 @@ class MachineClock:
         self.stepped_ns = 0  # the sum of all steps
 
     def ahead_ns(self, true_ns: int) -> int:
+        if not self._ahead_ns and not self._drift:
+            return 0
         return round(self._ahead_ns + (true_ns - self._since_ns) * self._drift)
 
     def set_by(self, true_ns: int, step_s: float) -> None:
@@ -83,10 +87,13 @@ class RobotProcess:
         clock: MachineClock,
         report: Report,
         wrap_bus: Callable[[Bus], Bus] = lambda bus: bus,
+        disk: Disk | None = None,
     ) -> None:
+        """`disk`: on which the robot is recorded, if it is."""
         self.name, self._team, self._network, self.clock = name, team, network, clock
-        self._report, self._wrap_bus = report, wrap_bus
+        self._report, self._wrap_bus, self._disk = report, wrap_bus, disk
         self.node: Node | None = None
+        self._next_ns = NEVER_NS  # of the node: only a step changes it
         self.witness: Witness | None = None
         self.is_paused = self._has_moved = False
         self._processes = self._stepped_ns = 0
@@ -117,12 +124,16 @@ class RobotProcess:
         self._bus = network.session(self.name, self.witness.note_delivery)
         callbacks = NodeCallbacks(on_status=self._on_status)
         watched = self.witness.watch(robot)
-        self.node = Node(watched, self._team, self._wrap_bus(self._bus), start, callbacks)
+        tape = NO_TAPE if self._disk is None else self._disk.tape(robot, self._team, start)
+        self.node = Node(watched, self._team, self._wrap_bus(self._bus), start, callbacks, tape)
+        self._next_ns = self.node.next_ns
 
     def kill(self) -> None:
         """The process ends without a word, and all that it knew is gone."""
         if self._bus is not None:
             self._bus.close()
+        if self._disk is not None:
+            self._disk.end_process()
         self._used = self.used
         self.node = self.witness = self._bus = None
 
@@ -139,21 +150,20 @@ class RobotProcess:
         """When the process has something to do, in true time."""
         if self.node is None or self.is_paused:
             return NEVER_NS
-        return self.node.next_ns - self.ahead_ns(self._network.now_ns)
+        return self._next_ns - self.ahead_ns(self._network.now_ns)
 
     @property
     def is_due(self) -> bool:
+        if self.node is None or self.is_paused:
+            return False
         now_ns = self._network.now_ns
-        return (
-            not self.is_paused
-            and self.node is not None
-            and (self.node.waiting or self.node.next_ns <= now_ns + self.ahead_ns(now_ns))
-        )
+        return self.node.waiting or self._next_ns <= now_ns + self.ahead_ns(now_ns)
 
     def step(self) -> None:
         now_ns = self._network.now_ns
         if self.node is not None:
             self.node.step(now_ns + self.ahead_ns(now_ns))
+            self._next_ns = self.node.next_ns
 
     def _on_status(self, status: Status) -> None:
         assert self.node is not None
@@ -161,6 +171,8 @@ class RobotProcess:
         self._has_moved |= self.node.has_moved
         self.statuses.append((self._network.now_ns * 1e-9, status))
         self.witness.check(self.node, status)
+        if self._disk is not None and (problem := self._disk.write(status)):
+            self._report("recorded", self.name, problem)
 
 
 class GuestProcess:

@@ -16,6 +16,7 @@ import numpy as np
 
 from cpcbl_launch.lab.chaos.run_log import ReceivedTrack, RunLog, TokenEvent
 from cpcbl_launch.lab.faulty_robot import Fault, FaultyBus
+from cpcbl_launch.lab.luck.disks import Disk
 from cpcbl_launch.lab.luck.history import Event, History
 from cpcbl_launch.lab.luck.members import BURSTS, Member
 from cpcbl_launch.lab.luck.network import FIELD, WATCHER, Network
@@ -33,8 +34,6 @@ from cpcbl_team.config import Team
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus
 from cpcbl_transport.messages import Track, decode_tagged
-
-TRUTH_NS = 100_000_000
 
 
 class Run(NamedTuple):
@@ -65,13 +64,24 @@ class Simulation:
         self._field = ClockedField(self.team, history.seed, clocks)
         self._field_node = FieldNode(self._field, network.session(FIELD))
         self._listen(network.session(WATCHER))
+        full = history.of_kind("disk-full")
+        recorded = {event.robot for event in full} & clocks.keys()
+        self._disks = {
+            name: Disk([event for event in full if event.robot == name], network)
+            for name in sorted(recorded)
+        }
         self.robots = {
-            name: RobotProcess(name, self.team, network, clock, self._report, self._wrapper(name))
+            name: RobotProcess(
+                *(name, self.team, network, clock, self._report),
+                self._wrapper(name),
+                self._disks.get(name),
+            )
             for name, clock in clocks.items()
         }
         self._guests: dict[str, GuestProcess] = {}
         for event in history.events:
-            self._schedule(event)
+            if event.kind != "disk-full":  # a disk knows its times
+                self._schedule(event)
 
     def run(self) -> Run:
         """Runs to the end, or to the first exception."""
@@ -81,19 +91,28 @@ class Simulation:
                 process.start()
             while network.now_ns < end_ns and not (self._stop_early and self.violations):
                 self._step(end_ns)
-            for robot in self.robots.values():
-                if robot.node is not None and robot.witness is not None:
-                    robot.witness.check_order(robot.node.robot.filter.timeline)
+            self._check_end()
         except Exception as bug:
             where = traceback.extract_tb(bug.__traceback__)[-1]
             what = (
                 f"{type(bug).__name__}: {bug} ({where.filename.rpartition('/')[2]}:{where.lineno})"
             )
             self._report("no exception", "", what)
+        finally:
+            for disk in self._disks.values():
+                disk.close()
         states = [r.node.robot.filter.timeline.state for r in self.robots.values() if r.node]
         self._digest.update("".join(map(_canonical, states)).encode())
         found, used = tuple(self.violations), sum(r.used for r in self.robots.values())
         return Run(self._log(), self._digest.hexdigest(), found, dict(self._messages), used)
+
+    def _check_end(self) -> None:
+        for robot in self.robots.values():
+            if robot.node is not None and robot.witness is not None:
+                robot.witness.check_order(robot.node.robot.filter.timeline)
+        for name, disk in self._disks.items():
+            for damage in disk.damage():
+                self._report("recorded", name, damage)
 
     def _step(self, end_ns: int) -> None:
         """Goes to the next time at which something is due, and does all of it."""
@@ -151,10 +170,12 @@ class Simulation:
     def _join(self, name: str) -> None:
         settings = guest_settings(self.team, name)
         team = msgspec.structs.replace(self.team, robots={**self.team.robots, name: settings})
-        self._guests[name] = GuestProcess(name, team, self.network)
+        if name not in self._guests:
+            self._guests[name] = GuestProcess(name, team, self.network)
 
     def _leave(self, name: str) -> None:
-        self._guests.pop(name).leave()
+        if name in self._guests:
+            self._guests.pop(name).leave()
 
     def _wrapper(self, name: str) -> Callable[[Bus], Bus]:
         """What stands between a robot and its bus: where it lies, its help is shifted."""

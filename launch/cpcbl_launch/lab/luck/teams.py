@@ -2,6 +2,7 @@
 
 import math
 from random import Random
+from typing import NamedTuple
 
 from msgspec.structs import replace
 
@@ -30,9 +31,26 @@ BUDGETS = (
     BudgetSettings(bytes_per_s=20.0),
     BudgetSettings(bytes_per_s=300.0),
     BudgetSettings(messages_per_minute=60.0),
+    BudgetSettings(messages_per_minute=15.0),
 )
 VARIANTS: tuple[Variant, ...] = ("joint", "joint", "joint", "oval", "circular")
-ODOMETRY_HZ, STEP_HZ = 10.0, 10.0
+
+
+class Rates(NamedTuple):
+    """How often things happen in one team (Hz)."""
+
+    odometry: float
+    cameras: tuple[float, ...]  # one for each robot
+    steps: float  # of the simulated field
+
+
+RATES = (
+    Rates(2.0, (1.0, 2.0), 4.0),
+    Rates(4.0, (1.0, 4.0), 4.0),
+    Rates(5.0, (1.0, 5.0), 5.0),
+    Rates(10.0, (2.0, 5.0), 10.0),
+)
+TIMEOUT_PIECES = 2.5  # a robot takes its odometry for missing after the time of so many pieces
 
 
 def team_of(seed: int) -> Team:
@@ -42,10 +60,13 @@ def team_of(seed: int) -> Team:
     size = dice.randint(*SIZES)
     budget = dice.choice(BUDGETS)
     rules = CollaborationSettings(budget=budget, after_s=dice.choice((0.0, 5.0)))
-    robots = {OBSERVER: _observer(dice, rules)}
+    rates = rates_of(seed)
+    robots = {OBSERVER: _observer(dice, rules, rates)}
     for number in range(1, size):
         is_blind = dice.random() < 0.4
-        robots[f"{'blind' if is_blind else 'guide'}{number}"] = _driver(dice, rules, is_blind)
+        robots[f"{'blind' if is_blind else 'guide'}{number}"] = _driver(
+            dice, rules, rates, is_blind
+        )
     marks = {f"m{n}": _landmark(dice, n) for n in range(dice.randint(4, 8))}
     variant = dice.choice(VARIANTS)
     localizer = LocalizerSettings(variant=variant)
@@ -53,8 +74,13 @@ def team_of(seed: int) -> Team:
         name="luck",
         robots={name: replace(robot, localizer=localizer) for name, robot in robots.items()},
         map=Field(landmarks=marks),
-        simulation=SimulationSettings(step_rate_hz=STEP_HZ),
+        simulation=SimulationSettings(step_rate_hz=rates.steps),
     )
+
+
+def rates_of(seed: int) -> Rates:
+    """The rates in the team of this seed."""
+    return Random(f"rates {seed}").choice(RATES)
 
 
 def is_blind(robot: str) -> bool:
@@ -69,6 +95,8 @@ def with_world_events(team: Team, history: History) -> Team:
         for e in history.of_kind("dark")
     ]
     for event in history.of_kind("kidnap"):
+        if event.robot not in team.robots:  # a team without guides
+            continue
         dice = Random(f"kidnap {history.seed} {event.number}")
         place = dice.uniform(1.0, WIDTH_M - 1.0), dice.uniform(1.0, HEIGHT_M - 1.5)
         to = *place, dice.uniform(-180.0, 180.0)
@@ -93,7 +121,7 @@ def _landmark(dice: Random, number: int) -> Landmark:
     return Landmark(x_m=dice.uniform(0.0, WIDTH_M), y_m=dice.choice((0.0, HEIGHT_M)))
 
 
-def _observer(dice: Random, rules: CollaborationSettings) -> RobotSettings:
+def _observer(dice: Random, rules: CollaborationSettings, rates: Rates) -> RobotSettings:
     return RobotSettings(
         start=Start(
             x_m=dice.uniform(3.0, 6.0),
@@ -108,14 +136,16 @@ def _observer(dice: Random, rules: CollaborationSettings) -> RobotSettings:
             bearing_sigma_deg=0.5,
             field_of_view_deg=200.0,
             max_range_m=12.0,
-            rate_hz=dice.choice((2.0, 5.0)),
+            rate_hz=dice.choice(rates.cameras),
         ),
-        odometry=OdometrySettings(moves=False, rate_hz=ODOMETRY_HZ),
+        odometry=OdometrySettings(moves=False, rate_hz=rates.odometry),
         collaboration=rules,
     )
 
 
-def _driver(dice: Random, rules: CollaborationSettings, is_blind: bool) -> RobotSettings:
+def _driver(
+    dice: Random, rules: CollaborationSettings, rates: Rates, is_blind: bool
+) -> RobotSettings:
     places = [(dice.uniform(1.0, WIDTH_M - 1.0), dice.uniform(1.0, HEIGHT_M - 1.5)) for _ in "1234"]
     (x_m, y_m), *others = places
     heading_deg = math.degrees(math.atan2(others[0][1] - y_m, others[0][0] - x_m))
@@ -129,14 +159,15 @@ def _driver(dice: Random, rules: CollaborationSettings, is_blind: bool) -> Robot
             bearing_sigma_deg=dice.choice((1.0, 3.0)),
             field_of_view_deg=dice.choice((90.0, 120.0, 360.0)),
             max_range_m=8.0,
-            rate_hz=dice.choice((2.0, 5.0)),
+            rate_hz=dice.choice(rates.cameras),
             sees_landmarks=not is_blind,
         ),
         odometry=OdometrySettings(
             distance_sigma_m_per_sqrt_m=noise,
             turn_sigma_rad_per_sqrt_rad=noise,
             turn_sigma_rad_per_sqrt_m=noise / 2.0,
-            rate_hz=ODOMETRY_HZ,
+            rate_hz=rates.odometry,
+            timeout_s=max(OdometrySettings().timeout_s, TIMEOUT_PIECES / rates.odometry),
         ),
         collaboration=rules,
     )

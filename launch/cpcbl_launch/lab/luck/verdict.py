@@ -7,7 +7,7 @@ import numpy as np
 from cpcbl_launch.lab.chaos.consistency import Consistency, consistency
 from cpcbl_launch.lab.chaos.history import longest_false_claim_s
 from cpcbl_launch.lab.chaos.run_log import TRACKS_HZ, RunLog
-from cpcbl_launch.lab.luck.history import Event, History, Kind
+from cpcbl_launch.lab.luck.history import History, Kind
 from cpcbl_launch.lab.luck.processes import RESTART_S
 from cpcbl_launch.lab.luck.spending import budget_windows
 from cpcbl_launch.lab.luck.teams import is_blind
@@ -19,9 +19,10 @@ from cpcbl_team.config import Team
 BACK_S = 12.0  # after the last event all robots are localized again,
 HELP_S = 15.0  # are helped again where they were before,
 TRUST_S = 20.0  # and trust each other
-GAP_S = 0.5
+GAP_S = 0.4  # between two tracks, beside the time between two pieces of odometry
 FALSE_S, FALSE_M = 4.0, 0.5
 SETTLING_S = 10.0  # after an event of which no robot can know, its team is not judged
+FRAMES = 20  # of the slowest camera of a team, in which robots settle and are localized again
 LEAST_S = 8.0  # of tracks, for a judgement
 UNKNOWABLE: tuple[Kind, ...] = ("liar", "clock-step", "kidnap", "odd-sightings", "lost-inputs")
 """What makes a robot's inputs or its help wrong in a way that its models do not have."""
@@ -30,13 +31,13 @@ UNKNOWABLE: tuple[Kind, ...] = ("liar", "clock-step", "kidnap", "odd-sightings",
 def violations(log: RunLog, history: History, team: Team) -> Iterator[Violation]:
     """What did not hold."""
     yield from _waiting(log, history, team)
-    trusted = without_unknowable(log, history)
+    trusted = without_unknowable(log, history, team)
     for name in history.robots:
         false_s = longest_false_claim_s(trusted, name, FALSE_M)
         if false_s > FALSE_S:
             what = f"it was wrong by 5 sigma for {false_s:.1f} s and did not say so"
             yield Violation("lost honestly", name, history.duration_s, what)
-        if found := consistency_of(trusted, name):
+        if found := consistency_of(trusted, name, tracks_hz(team, name)):
             if found.nees > found.nees_bound:
                 what = f"NEES {found.nees:.2f}, at most {found.nees_bound:.2f}"
                 yield Violation("consistent", name, history.duration_s, what)
@@ -50,12 +51,13 @@ def _waiting(log: RunLog, history: History, team: Team) -> Iterator[Violation]:
     at the end."""
     healed_s, end_s = history.healed_s, history.duration_s
     quiet_s = end_s - max(healed_s, _silent_until_s(history, team))
+    back_s = max(BACK_S, frames_s(team))
     for name in history.robots:
         gap_s = log.longest_track_gap_s(name, healed_s + 2.0, end_s)
-        if quiet_s > 3.0 and gap_s > GAP_S:
+        if quiet_s > 3.0 and gap_s > GAP_S + 1.0 / tracks_hz(team, name):
             yield Violation("nobody waits", name, end_s, f"no track for {gap_s:.1f} s")
         after_s = log.localized_after_s(name, healed_s)
-        if quiet_s > BACK_S + 1.0 and (after_s is None or after_s > BACK_S):
+        if quiet_s > back_s + 1.0 and (after_s is None or after_s > back_s):
             text = "never" if after_s is None else f"only {after_s:.1f} s after the last event"
             yield Violation("nobody waits", name, end_s, f"it was localized {text}")
         if quiet_s > HELP_S and _misses_help(log, name, end_s):
@@ -85,10 +87,16 @@ def _misses_help(log: RunLog, robot: str, end_s: float) -> bool:
     return is_blind(robot) and log.counts_between(robot, end_s - HELP_S)["messages_received"] == 0
 
 
-def without_unknowable(log: RunLog, history: History) -> RunLog:
+def frames_s(team: Team) -> float:
+    """The time of `FRAMES` frames of the slowest camera."""
+    return FRAMES / min(robot.sensor.rate_hz for robot in team.robots.values())
+
+
+def without_unknowable(log: RunLog, history: History, team: Team) -> RunLog:
     """The log without the tracks of robots that said that they were lost, and without those of
     times of which no robot can know that its inputs or its help are wrong."""
-    spans = [_span(event) for event in history.of_kind(*UNKNOWABLE)]
+    settling_s = max(SETTLING_S, frames_s(team))
+    spans = [(e.from_s, e.until_s + settling_s) for e in history.of_kind(*UNKNOWABLE)]
     tracks = {
         name: [
             t for t in tracks if not t.track.lost and not any(a <= t.stamp_s < b for a, b in spans)
@@ -98,18 +106,22 @@ def without_unknowable(log: RunLog, history: History) -> RunLog:
     return log._replace(tracks=tracks)
 
 
-def _span(event: Event) -> tuple[float, float]:
-    return event.from_s, event.until_s + SETTLING_S
+def tracks_hz(team: Team, robot: str) -> float:
+    """How often a robot sends a track: with each piece of odometry, but no more often than robots
+    report; one that stands has none to wait for."""
+    odometry = team.robots[robot].odometry
+    return min(TRACKS_HZ, odometry.rate_hz) if odometry.moves else TRACKS_HZ
 
 
-def consistency_of(log: RunLog, robot: str) -> Consistency | None:
-    """How well the robot's stated uncertainty fits its errors; None where there is too little."""
+def consistency_of(log: RunLog, robot: str, rate_hz: float) -> Consistency | None:
+    """How well the robot's stated uncertainty fits its errors; None where there is too little.
+    `rate_hz`: of its tracks."""
     tracks = [t for t in log.tracks[robot] if t.track.covariance]
-    if len(tracks) < LEAST_S * TRACKS_HZ:
+    if len(tracks) < LEAST_S * rate_hz:
         return None
     stamps_s = np.array([t.stamp_s for t in tracks])
     estimate = np.array([(t.track.x_m, t.track.y_m, t.track.heading_rad) for t in tracks])
     covariance = np.array([t.track.covariance for t in tracks])
     truth, known = metrics.interpolated_truth(stamps_s, log.truth[robot])
     samples = Samples(estimate[known], truth[known], covariance[known])
-    return consistency(robot, samples, samples, TRACKS_HZ)
+    return consistency(robot, samples, samples, rate_hz)

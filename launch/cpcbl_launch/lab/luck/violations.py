@@ -13,6 +13,7 @@ INVARIANTS = {
     "quarantined": "nothing of a teammate in quarantine is used",
     "bounded": "what a robot keeps and declares is bounded",
     "consistent": "stated uncertainties hold",
+    "recorded": "a full disk ends a recording, which says so; what is recorded replays",
     "lost honestly": "a robot that is wrong says so",
     "nobody waits": "after the last event all are localized, helped and trusted again",
 }
