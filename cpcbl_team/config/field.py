@@ -17,6 +17,8 @@ class Landmark(Table, frozen=True, kw_only=True):
 
     x_m: float
     y_m: float
+    sigma_m: NotNegative = 0.0
+    """Standard deviation of its place along each axis of the field (m); 0: it is known exactly."""
     gives: Gives = "both"
     """Which measurements of it the robots use."""
     colours: Bands | None = None

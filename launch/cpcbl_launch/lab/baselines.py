@@ -26,9 +26,9 @@ from cpcbl_launch.run.logged_team import LoggedTeam
 from cpcbl_team import sensors
 from cpcbl_team.config import Field, LocalizationSettings, SensorSettings
 from cpcbl_team.constraints import NEAREST_M
-from cpcbl_team.estimate import ZERO3, Covariance3, Estimate
+from cpcbl_team.estimate import Covariance3, Estimate
 from cpcbl_team.fusion import chi_square_bounds
-from cpcbl_team.geometry import Pose2, wrap_angle
+from cpcbl_team.geometry import wrap_angle
 from cpcbl_team.inputs import Odometry, Sighting, Sightings
 from cpcbl_team.object_timers import ObjectTimers
 from cpcbl_team.state import Updates

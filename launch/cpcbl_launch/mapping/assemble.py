@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from cpcbl_launch.calibration.statistics import Integers
 from cpcbl_launch.mapping.drives import Drive
 from cpcbl_launch.mapping.problem import (
     BEARING,
@@ -85,13 +86,20 @@ def assemble(
         poses,
         len(names),
         len(drives),
-        1e-9 * np.concatenate([np.array(d.stamps_ns, dtype=np.float64) for d in drives]),
+        _in_time(drives),
         _motions(drives, first.tolist()),
         _readings(drives, start, names, first.tolist()),
         Priors(np.empty(0, np.int64), np.empty(0), np.empty(0)),
     )
     priors = _priors(problem, names, first.tolist(), frame, errors)
     return problem._replace(priors=priors), np.concatenate(unknowns), names
+
+
+def _in_time(drives: Sequence[Drive]) -> Integers:
+    runs = list(dict.fromkeys(drive.run for drive in drives))
+    run = np.concatenate([np.full(len(d.stamps_ns), runs.index(d.run)) for d in drives])
+    stamps = np.concatenate([np.array(d.stamps_ns, dtype=np.int64) for d in drives])
+    return np.lexsort((stamps, run))
 
 
 def _motions(drives: Sequence[Drive], first: Sequence[int]) -> Motions:
@@ -133,8 +141,8 @@ def _readings(
             rows.append((*row, used.inflation, used.inflation, used.stamp_ns * 1e-9))
     table = np.array(rows, dtype=np.float64).reshape(-1, 11)
     indices = table[:, :4].astype(np.int64)
-    sigmas = np.maximum(table[:, 6:8], SMALLEST_SIGMA)
-    return Readings(*indices.T, *table[:, 4:6].T, *sigmas.T, *table[:, 8:].T)
+    least = np.maximum(table[:, 6:8], SMALLEST_SIGMA)
+    return Readings(*indices.T, *table[:, 4:6].T, *least.T, *table[:, 8:].T)
 
 
 def _priors(

@@ -53,7 +53,9 @@ class Drive(NamedTuple):
     settings: LocalizationSettings
     stamps_ns: tuple[int, ...]  # of the poses
     pose_of: Mapping[int, int]  # the index of the pose at a time; while it stands it has one pose
-    motions: Floats  # (n - 1, 3): x, y (m), heading (rad) of each pose in the frame of the one before
+    motions: (
+        Floats  # (n - 1, 3): x, y (m), heading (rad) of each pose in the frame of the one before
+    )
     noises: Floats  # (n - 1, 3, 3): their covariances
     sightings: tuple[UsedSighting, ...]
 
@@ -81,10 +83,11 @@ def build_drives(team: Team, runs: Sequence[RunInputs], ignored: Iterable[str] =
         notes += remarks
     robots = {*team.robots, *(drive.robot for drive in drives)}
     seen = {used.sighting.id for drive in drives for used in drive.sightings}
-    return Drives(tuple(drives), tuple(sorted(seen - robots, key=_natural)), left_out, tuple(notes))
+    return Drives(tuple(drives), tuple(sorted(seen - robots, key=natural)), left_out, tuple(notes))
 
 
-def _natural(name: str) -> tuple[int, int, str]:
+def natural(name: str) -> tuple[int, int, str]:
+    """The key of a name for an order in which numbers come first, by their size."""
     return (0, int(name), name) if name.isdigit() else (1, 0, name)
 
 
@@ -93,7 +96,7 @@ def _drives_of_run(
 ) -> tuple[list[Drive], Counter[str], list[str]]:
     left_out, notes = Counter[str](), list[str]()
     odometry: dict[str, list[Odometry]] = {}
-    for robot in sorted({*run.odometry, *run.frames}, key=_natural):
+    for robot in sorted({*run.odometry, *run.frames}, key=natural):
         if robot not in team.robots:
             notes.append(f"{run.name}: robot {robot} is not in the team, so it is not used")
             continue
@@ -111,7 +114,7 @@ def _drives_of_run(
         frames = run.frames.get(robot, ())
         used[robot] = _used_sightings(team, robot, frames, ignored, left_out)
     drives = [
-        _drive(team.robots[robot], robot, run.name, pieces, used)
+        _make_drive(team.robots[robot], robot, run.name, pieces, used)
         for robot, pieces in odometry.items()
         if pieces or used[robot]
     ]
@@ -176,7 +179,7 @@ def _usable(team: Team, robot: str, sighting: Sighting) -> Sighting:
     )
 
 
-def _drive(
+def _make_drive(
     settings: LocalizationSettings,
     robot: str,
     run: str,
@@ -230,9 +233,8 @@ def _span_ns(
 def _often_enough(stamps_ns: Sequence[int]) -> list[int]:
     times = [stamps_ns[0]]
     for stamp_ns in stamps_ns[1:]:
-        steps = math.ceil((stamp_ns - times[-1]) / LONGEST_STEP_NS)
-        before_ns = times[-1]
-        for i in range(1, steps):
-            times.append(before_ns + i * (stamp_ns - before_ns) // steps)
+        before_ns, between_ns = times[-1], stamp_ns - times[-1]
+        steps = math.ceil(between_ns / LONGEST_STEP_NS)
+        times += [before_ns + i * between_ns // steps for i in range(1, steps)]
         times.append(stamp_ns)
     return times

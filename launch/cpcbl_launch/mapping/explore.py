@@ -72,7 +72,8 @@ class _Filter:
         self._rejected = 0
         gain = cross @ weights
         self.mean += gain @ innovation
-        self.covariance -= gain @ cross.T
+        covariance = self.covariance - gain @ cross.T
+        self.covariance = 0.5 * (covariance + covariance.T)
 
     def _add(self, name: str, read: Floats, variances: Floats) -> None:
         n, angle = len(self.mean), self.mean[2] + read[1]
@@ -97,7 +98,11 @@ def explore(drive: Drive, robots: frozenset[str]) -> LocalMap:
         r, b = used.sighting.range_m, used.sighting.bearing_rad
         if used.sighting.id not in robots and r is not None and b is not None:
             sigmas = np.array(sighting_sigmas(used.sighting, drive.settings.sensor))
-            entry = used.sighting.id, np.array([r, b]), np.maximum(sigmas, 1e-4) ** 2
+            entry = (
+                used.sighting.id,
+                np.array([r, b]),
+                used.inflation * np.maximum(sigmas, 1e-4) ** 2,
+            )
             own.setdefault(used.pose, []).append(entry)
             number += 1
     ekf, poses = _Filter(), list[Floats]()
@@ -111,9 +116,7 @@ def explore(drive: Drive, robots: frozenset[str]) -> LocalMap:
     return LocalMap(path, _medians(path, own), number)
 
 
-def _medians(
-    path: Floats, own: dict[int, list[tuple[str, Floats, Floats]]]
-) -> dict[str, Floats]:
+def _medians(path: Floats, own: dict[int, list[tuple[str, Floats, Floats]]]) -> dict[str, Floats]:
     """The median of where each landmark was seen: a wrong first sighting must not place it."""
     places: dict[str, list[Floats]] = {}
     for index, entries in own.items():

@@ -21,6 +21,7 @@ from cpcbl_launch.reporting.metrics import Floats
 from cpcbl_team.sensors import repetition_variance_factor
 
 PROBES = 12
+LEAST_FACTOR = 0.2  # readings without any noise would have weights without bounds
 LEAST_SHARE = 0.3  # of the variance that a fit leaves, below which residuals say too little
 MOTION, RANGE, BEARING = range(3)
 
@@ -36,25 +37,25 @@ class Noise(NamedTuple):
 def estimate_noise(problem: Problem, solution: Solution, seed: int = 0) -> Noise:
     """The noise of each drive."""
     left = _left_shares(problem, solution, seed)
-    factors, correlation = np.full((problem.drives, 3), np.nan), np.full((problem.drives, 2), np.nan)
+    factors, correlation = (
+        np.full((problem.drives, 3), np.nan),
+        np.full((problem.drives, 2), np.nan),
+    )
     motions = motion_blocks(problem, solution.x).residuals * solution.weights.motions[:, None]
     errors, readings = reading_blocks(problem, solution.x).residuals, problem.readings
     weight = solution.weights.readings**2
     measured = np.isfinite(np.stack([readings.range_m, readings.bearing], axis=1))
     objects = np.where(readings.mate >= 0, -1, readings.landmark)
     for drive in range(problem.drives):
-        mine = problem.motions.drive == drive
-        if mine.sum() >= MIN_ROWS and left[drive, MOTION] > LEAST_SHARE:
-            variance = np.mean(motions[mine] ** 2) / left[drive, MOTION]
-            factors[drive, MOTION] = np.sqrt(variance)
         for kind in (0, 1):
             mine = (readings.drive == drive) & measured[:, kind]
             if mine.sum() < MIN_ROWS or left[drive, 1 + kind] < LEAST_SHARE:
                 continue
             square = np.sum(weight[mine] * errors[mine, kind] ** 2) / np.sum(weight[mine])
-            factors[drive, 1 + kind] = np.sqrt(square / left[drive, 1 + kind])
+            found = float(np.sqrt(square / left[drive, 1 + kind]))
+            factors[drive, 1 + kind] = max(found, LEAST_FACTOR)
             stretch = np.zeros(mine.sum(), np.int64)
-            unit = errors[mine, kind] / np.sqrt(square)
+            unit = errors[mine, kind] / max(float(np.sqrt(square)), 1e-9)
             pairs = error_pairs(stretch, readings.stamp_s[mine], objects[mine], [unit])
             correlation[drive, kind] = correlation_time_s(pairs)
     return Noise(factors, correlation, left)
@@ -90,7 +91,9 @@ def with_noise(problem: Problem, noise: Noise) -> Problem:
     motions, readings = problem.motions, problem.readings
     whitening = motions.whitening / factors[motions.drive, MOTION][:, None, None]
     inflations = [
-        _inflation(readings.drive, _objects(problem), readings.stamp_s, noise.correlation_s[:, k], old)
+        _inflation(
+            readings.drive, _objects(problem), readings.stamp_s, noise.correlation_s[:, k], old
+        )
         for k, old in enumerate((readings.range_inflation, readings.bearing_inflation))
     ]
     return problem._replace(

@@ -18,7 +18,7 @@ from cpcbl_launch.reporting.metrics import Floats
 
 MANY_READINGS = 300  # of one pose, from which on it belongs to the border
 CHUNK = 64  # columns of the border that are eliminated at a time
-LEAST_INFORMATION = 1e-9  # of every unknown, in its unit^-2: (30 km)^2
+LEAST_INFORMATION = 1e-9  # of every unknown, in its unit^-2: a sigma of 30 km
 
 
 def elimination_order(problem: Problem) -> tuple[Integers, Integers]:
@@ -27,7 +27,7 @@ def elimination_order(problem: Problem) -> tuple[Integers, Integers]:
     number = np.bincount(readings.pose, minlength=problem.poses)
     number += np.bincount(readings.mate[readings.mate >= 0], minlength=problem.poses)
     busy = number > MANY_READINGS
-    by_time = np.argsort(problem.stamps_s, kind="stable")
+    by_time = problem.in_time
     inner = (3 * by_time[~busy[by_time]][:, None] + np.arange(3)).ravel()
     standing = (3 * np.flatnonzero(busy)[:, None] + np.arange(3)).ravel()
     rest = np.arange(problem.landmark_column(), problem.size)
@@ -37,7 +37,9 @@ def elimination_order(problem: Problem) -> tuple[Integers, Integers]:
 class NormalEquations:
     """J^T J of a linearized problem, with each diagonal element times 1 + damping."""
 
-    def __init__(self, linear: Linearized, order: tuple[Integers, Integers], damping: float) -> None:
+    def __init__(
+        self, linear: Linearized, order: tuple[Integers, Integers], damping: float
+    ) -> None:
         """Raises RuntimeError, LinAlgError where the unknowns are not determined."""
         self._inner, self._border = order
         hessian: Any = (linear.jacobian.T @ linear.jacobian).tocsr()

@@ -59,7 +59,7 @@ class Problem(NamedTuple):
     poses: int
     landmarks: int
     drives: int
-    stamps_s: Floats  # (poses,)
+    in_time: Integers  # (poses,), the poses in the order of runs, and there of time
     motions: Motions
     readings: Readings
     priors: Priors

@@ -4,13 +4,13 @@ Sources: Triggs et al. (1999), "Bundle adjustment, a modern synthesis"; Huber (1
 readings are Cauchy's, iterated.
 """
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 
 from cpcbl_launch.mapping.normal_equations import NormalEquations, elimination_order
 from cpcbl_launch.mapping.problem import (
+    CONSTANTS,
     Problem,
     Weights,
     linearize,
@@ -22,8 +22,8 @@ from cpcbl_launch.reporting.metrics import Floats
 CAUCHY_SIGMAS = 3.0  # of a reading; a Gaussian one keeps 90 % of its information
 HUBER_SIGMAS = 4.0  # of a motion: a wheel that slips is rare
 ITERATIONS = 60
-CONVERGED_M = 5e-5  # the largest step of a landmark
-LEAST_DAMPING, MOST_DAMPING = 1e-9, 1e9
+CONVERGED_M = 1e-4  # the largest step of a landmark
+LEAST_DAMPING, MOST_DAMPING = 1e-15, 1e9  # near pairs hardly hold the whole map's direction
 
 
 class Solution(NamedTuple):
@@ -54,10 +54,9 @@ def robust_weights(problem: Problem, x: Floats) -> tuple[Weights, float]:
     return Weights(np.sqrt(huber), 1.0 / np.sqrt(1.0 + square / c2)), 0.5 * loss
 
 
-def solve(
-    problem: Problem, start: Floats, progress: Callable[[float], None] = lambda done: None
-) -> Solution:
-    """The unknowns with the least robust cost near `start`, shape (unknowns,)."""
+def solve(problem: Problem, start: Floats, least_step_m: float = CONVERGED_M) -> Solution:
+    """The unknowns with the least robust cost near `start`, shape (unknowns,). It ends when a step
+    moves no landmark by `least_step_m`."""
     x, damping, order = start.copy(), 1e-4, elimination_order(problem)
     weights, cost = robust_weights(problem, x)
     landmarks = slice(problem.landmark_column(), problem.constant_column())
@@ -73,9 +72,8 @@ def solve(
         gained = cost - trial_cost
         if gained >= 0.0:
             x, weights, cost = x + step, trial_weights, trial_cost
-        damping = max(damping * 0.1, LEAST_DAMPING)
-        progress(iteration / ITERATIONS)
-        small = np.abs(step[landmarks]).max(initial=0.0) < CONVERGED_M and damping < 1.0
+        damping = max(damping * 0.05, LEAST_DAMPING)
+        small = np.abs(step[landmarks]).max(initial=0.0) < least_step_m and damping < 1.0
         if small or gained < 1e-9 * (1e-6 + cost):
             return Solution(x, weights, cost, iteration, True)
     return Solution(x, weights, cost, ITERATIONS, False)
@@ -93,3 +91,11 @@ def landmark_covariance(problem: Problem, equations: NormalEquations) -> Floats:
     first = len(border) - (problem.size - problem.landmark_column())
     part = slice(first, first + 2 * problem.landmarks)
     return border[part, part]
+
+
+def constant_errors(problem: Problem, solution: Solution) -> tuple[Floats, Floats]:
+    """The constant errors of all drives and their sigmas, each of shape (drives, 4)."""
+    border = solved_equations(problem, solution).border_covariance()
+    number = CONSTANTS * problem.drives
+    sigmas = np.sqrt(np.maximum(np.diag(border)[len(border) - number :], 0.0))
+    return problem.parts(solution.x)[2], sigmas.reshape(-1, CONSTANTS)
