@@ -18,9 +18,8 @@ from cpcbl_launch.mapping.sensor_check import sensor_fault
 from cpcbl_launch.mapping.solve import (
     CONVERGED_M,
     Solution,
-    landmark_covariance,
+    covariances,
     solve,
-    solved_equations,
 )
 from cpcbl_launch.mapping.triangulate import add_triangulated
 from cpcbl_launch.reporting.metrics import Floats
@@ -55,6 +54,7 @@ class Mapped(NamedTuple):
     problem: Problem
     solution: Solution
     covariance: Floats  # (2 landmarks, 2 landmarks), with the error of where a landmark seems to be
+    constant_sigmas: Floats  # (drives, 4)
     noise: Noise
     notes: tuple[str, ...]
     left_out: Mapping[str, int]  # sightings, by reason
@@ -174,9 +174,9 @@ def _finished(
     if not solution.converged:
         notes = (*notes, f"least squares did not converge in {solution.iterations} steps")
     progress(0.95)
-    covariance = landmark_covariance(problem, solved_equations(problem, solution))
+    found = covariances(problem, solution)
     new = [name not in attempt.frame.known for name in attempt.names]
-    covariance = covariance + np.diag(np.repeat(new, 2) * request.place_sigma_m**2)
+    covariance = found.landmarks + np.diag(np.repeat(new, 2) * request.place_sigma_m**2)
     return Mapped(
         attempt.drives,
         attempt.names,
@@ -185,6 +185,7 @@ def _finished(
         problem,
         solution,
         covariance,
+        found.constants,
         noise,
         notes,
         dict(everything.left_out),

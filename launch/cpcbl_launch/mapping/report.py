@@ -14,7 +14,6 @@ from cpcbl_launch.mapping.mapper import Mapped
 from cpcbl_launch.mapping.noise import BEARING as BEARING_NOISE
 from cpcbl_launch.mapping.noise import RANGE as RANGE_NOISE
 from cpcbl_launch.mapping.problem import BEARING, DISTANCE, RANGE, TURN
-from cpcbl_launch.mapping.solve import constant_errors
 from cpcbl_launch.reporting.metrics import Floats
 from cpcbl_launch.reporting.tables import STYLES, plural, table
 
@@ -108,7 +107,7 @@ def _landmark(mapped: Mapped, name: str) -> LandmarkReport:
 
 
 def _drives(mapped: Mapped) -> Iterator[DriveReport]:
-    values, sigmas = constant_errors(mapped.problem, mapped.solution)
+    values, sigmas = mapped.problem.parts(mapped.solution.x)[2], mapped.constant_sigmas
     for i, drive in enumerate(mapped.drives):
         each = [
             Estimate(*pair) for pair in zip(values[i].tolist(), sigmas[i].tolist(), strict=True)

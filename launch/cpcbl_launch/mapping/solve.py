@@ -85,17 +85,17 @@ def solved_equations(problem: Problem, solution: Solution) -> NormalEquations:
     return NormalEquations(linear, elimination_order(problem), 0.0)
 
 
-def landmark_covariance(problem: Problem, equations: NormalEquations) -> Floats:
-    """The covariance of all landmarks, shape (2 landmarks, 2 landmarks)."""
-    border = equations.border_covariance()
-    first = len(border) - (problem.size - problem.landmark_column())
-    part = slice(first, first + 2 * problem.landmarks)
-    return border[part, part]
+class Covariances(NamedTuple):
+    """What a solution says of its own accuracy."""
+
+    landmarks: Floats  # (2 landmarks, 2 landmarks)
+    constants: Floats  # (drives, 4): sigmas of the constant errors
 
 
-def constant_errors(problem: Problem, solution: Solution) -> tuple[Floats, Floats]:
-    """The constant errors of all drives and their sigmas, each of shape (drives, 4)."""
+def covariances(problem: Problem, solution: Solution) -> Covariances:
+    """The covariance of all landmarks, and the sigmas of the constant errors."""
     border = solved_equations(problem, solution).border_covariance()
-    number = CONSTANTS * problem.drives
-    sigmas = np.sqrt(np.maximum(np.diag(border)[len(border) - number :], 0.0))
-    return problem.parts(solution.x)[2], sigmas.reshape(-1, CONSTANTS)
+    first = len(border) - (problem.size - problem.landmark_column())
+    middle = first + 2 * problem.landmarks
+    constants = np.sqrt(np.maximum(np.diag(border)[middle:], 0.0)).reshape(-1, CONSTANTS)
+    return Covariances(border[first:middle, first:middle], constants)
