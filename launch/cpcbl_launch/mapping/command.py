@@ -6,7 +6,8 @@ from pathlib import Path
 import numpy as np
 from msgspec.structs import replace
 
-from cpcbl_launch.mapping.mapper import Mapped, Progress, Request, build_map
+from cpcbl_launch.mapping.first_estimate import Request
+from cpcbl_launch.mapping.mapper import Mapped, Progress, build_map
 from cpcbl_launch.mapping.runs import read_runs, surveyed_landmarks
 from cpcbl_launch.reporting.metrics import write_tum
 from cpcbl_launch.reporting.recorded_file import read_recording

@@ -9,7 +9,8 @@ import pytest
 from msgspec.structs import replace
 from support.mapping_worlds import MARKS, Change, make_world
 
-from cpcbl_launch.mapping.mapper import Mapped, Request, build_map
+from cpcbl_launch.mapping.first_estimate import Request
+from cpcbl_launch.mapping.mapper import Mapped, build_map
 from cpcbl_team.config import Landmark
 from cpcbl_team.errors import InputError
 from cpcbl_team.inputs import Sighting

@@ -1,4 +1,4 @@
-"""Maps of simulated runs: exact without noise, consistent with it, in the frame that is asked for."""
+"""Maps of simulated runs: exact without noise, consistent with it, in the frame that is asked."""
 
 import math
 from typing import NamedTuple
@@ -8,7 +8,8 @@ import pytest
 from msgspec.structs import replace
 from support.mapping_worlds import World, make_world
 
-from cpcbl_launch.mapping.mapper import Mapped, Request, build_map
+from cpcbl_launch.mapping.first_estimate import Request
+from cpcbl_launch.mapping.mapper import Mapped, build_map
 from cpcbl_launch.reporting.metrics import Floats
 from cpcbl_team.config import Landmark
 

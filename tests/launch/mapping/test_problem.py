@@ -7,7 +7,8 @@ import pytest
 from support.mapping_worlds import make_world
 
 from cpcbl_launch.mapping.align import Rigid, fit_rigid
-from cpcbl_launch.mapping.mapper import Request, build_map
+from cpcbl_launch.mapping.first_estimate import Request
+from cpcbl_launch.mapping.mapper import build_map
 from cpcbl_launch.mapping.normal_equations import NormalEquations, elimination_order
 from cpcbl_launch.mapping.problem import (
     CONSTANTS,
