@@ -57,7 +57,9 @@ WAYS = {
         "written: lab.toml"
     ),
     "cpcbl-team calibrate map mrclam MRCLAM6 --known 6,20 --dry-run": Way(
-        r"\[map.landmarks.9\]", instead=("6,20", "6,8"), shows=("landmarks from MRCLAM6",)
+        r"\[map.landmarks.9\]",
+        instead=("mrclam MRCLAM6 --known 6,20", "mrclam-uncalibrated MRCLAM6 --known 6,8"),
+        shows=("landmarks from MRCLAM6",),
     ),
     "cpcbl-team calibrate map team.toml run --known door,east --picture map.png": Way(
         "written: team.toml"

@@ -60,10 +60,15 @@ def _centre(mapped: Mapped) -> Floats:
 
 
 def _turning_sigma(mapped: Mapped) -> float:
-    """The sigma (rad) of the turn of the whole map around its centre."""
+    """The sigma (rad) of the turn of the whole map around its centre: of the mean angle by which
+    its landmarks may be turned. One that is badly known alone moves it little."""
     offset = mapped.problem.parts(mapped.solution.x)[1] - _centre(mapped)
-    across = np.stack([-offset[:, 1], offset[:, 0]], axis=1).ravel()
-    gain = across / max(float(across @ across), 1e-9)
+    squared = np.sum(offset**2, axis=1)
+    across = np.stack([-offset[:, 1], offset[:, 0]], axis=1)
+    new = [name not in mapped.frame.known for name in mapped.names]
+    counts = np.array(new) & (squared > NEAR_M**2)
+    gain = np.where(counts[:, None], across / np.maximum(squared, 1e-9)[:, None], 0.0).ravel()
+    gain /= max(int(counts.sum()), 1)
     return math.sqrt(max(float(gain @ mapped.covariance @ gain), 0.0))
 
 

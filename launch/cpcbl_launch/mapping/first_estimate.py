@@ -75,7 +75,7 @@ def _reference(drives: Sequence[Drive], maps: Sequence[LocalMap], robot: str) ->
     """The drive in whose frame the others are joined: of the robot whose start is known, else that
     with the most sightings of landmarks. Raises InputError."""
     if not drives:
-        raise InputError("calibrate map: no robot of these runs can be used; see the notes")
+        raise InputError("calibrate map: no robot of these runs can be used")
     mine = [i for i, drive in enumerate(drives) if not robot or drive.robot == robot]
     if not mine:
         raise InputError(f"--start {robot}: no run has odometry and sightings of this robot")

@@ -38,11 +38,11 @@ def check_known(known: Mapping[str, Landmark], measured: Mapping[str, Floats]) -
                 " direction: they are not used"
             )
             return KnownMap({}, None, tuple(notes))
-        is_wide = spread_m(points) > LEAST_SPREAD_M
-        if is_wide and (fault := _whole_fault(tuple(usable), points, places)):
-            return KnownMap({}, None, (*notes, fault))
         worst, error_m = _worst(points, places)
         if worst < 0:
+            is_wide = spread_m(points) > LEAST_SPREAD_M
+            if is_wide and (fault := _whole_fault(tuple(usable), points, places)):
+                return KnownMap({}, None, (*notes, fault))
             return KnownMap(usable, fit_rigid(points, places), tuple(notes))
         name = tuple(usable)[worst]
         del usable[name]

@@ -1,11 +1,11 @@
 """The map of some runs: from what robots reported to landmarks with their covariance."""
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from cpcbl_launch.mapping.assemble import Frame
+from cpcbl_launch.mapping.assemble import ConstantErrors, Frame
 from cpcbl_launch.mapping.displacements import displaced_landmarks
 from cpcbl_launch.mapping.doubled_names import doubled_names
 from cpcbl_launch.mapping.drives import Drive, Drives, RunInputs, build_drives
@@ -16,9 +16,12 @@ from cpcbl_launch.mapping.sensor_check import sensor_fault
 from cpcbl_launch.mapping.solve import CONVERGED_M, Solution, covariances, solve
 from cpcbl_launch.reporting.metrics import Floats
 from cpcbl_team.config import Team
+from cpcbl_team.errors import InputError
 
 LEAST_SIGHTINGS = 10  # used ones, of a landmark
 ROUGHLY_M = 1e-3  # the step at which a first solution is good enough to judge its residuals
+MOST_SIGMAS = 5.0  # of the prior of a constant error
+MOST_FAULTY = 0.5  # of the landmarks: with more it is the paths that are wrong
 MOST_ROUNDS = 4  # of leaving out landmarks that moved
 
 Progress = Callable[[float], None]
@@ -75,13 +78,15 @@ def build_map(
             drives.append(_without(drive, ignored))
     for _ in range(MOST_ROUNDS):
         progress(0.1)
-        first = first_estimate(team, drives, request)
+        first = _first_or_notes(team, drives, request, notes)
         progress(0.25)
         rough = solve(first.problem, first.x, ROUGHLY_M)
         of_drives = [drive.run for drive in first.drives]
         faults = displaced_landmarks(first.problem, rough.x, first.names, of_drives)
         if not faults:
             break
+        if len(faults) > MOST_FAULTY * len(first.names):
+            raise InputError(_does_not_fit([first.names[fault.landmark] for fault in faults]))
         names = {first.names[fault.landmark] for fault in faults}
         notes += [fault.words for fault in faults]
         drives = [_without(drive, names) for drive in drives]
@@ -89,6 +94,38 @@ def build_map(
         request = request._replace(known=known)
     progress(0.5)
     return _finished(first, rough, (*notes, *first.notes), everything, request, progress)
+
+
+def _unusual(drives: Sequence[Drive], constants: Floats, errors: ConstantErrors) -> Iterator[str]:
+    """A line for each drive with a constant error that its settings do not let expect."""
+    words = "distances %+.0f %%", "turns %+.0f %%", "bearings %+.1f deg", "ranges %+.0f %%"
+    units = np.array([100.0, 100.0, np.degrees(1.0), 100.0])
+    for drive, values in zip(drives, constants, strict=True):
+        beyond = np.flatnonzero(np.abs(values) > MOST_SIGMAS * errors.sigmas)
+        if len(beyond):
+            said = ", ".join(words[i] % (values[i] * units[i]) for i in beyond)
+            yield (
+                f"{drive.name} reads other than its settings say: {said}: calibrate it; the map may"
+                " be wrong"
+            )
+
+
+def _does_not_fit(names: Sequence[str]) -> str:
+    return (
+        f"calibrate map: sightings put most landmarks ({', '.join(names)}) at several places:"
+        " odometry or sensors are not as the robots' settings say; calibrate them first, and check"
+        " that the clocks of sightings and odometry agree"
+    )
+
+
+def _first_or_notes(
+    team: Team, drives: Sequence[Drive], request: Request, notes: Sequence[str]
+) -> FirstEstimate:
+    """The first estimate; an error says what was not used besides. Raises InputError."""
+    try:
+        return first_estimate(team, drives, request)
+    except InputError as error:
+        raise InputError("; ".join((str(error), *notes))) from error
 
 
 def _finished(
@@ -104,6 +141,7 @@ def _finished(
     problem = with_noise(first.problem, noise)
     progress(0.6)
     solution = solve(problem, rough.x, CONVERGED_M)
+    notes = (*notes, *_unusual(first.drives, problem.parts(solution.x)[2], request.errors))
     if not solution.converged:
         notes = (*notes, f"least squares did not converge in {solution.iterations} steps")
     progress(0.95)

@@ -162,3 +162,15 @@ def test_nothing_to_map_is_one_line() -> None:
         build_map(world.team, world.runs, Request({}))
     with pytest.raises(InputError, match="no robot of these runs"):
         build_map(world.team, [world.runs[0]._replace(odometry={})], Request({}))
+
+
+def test_settings_that_do_not_fit_are_named() -> None:
+    """Odometry says twice the turn, which no prior expects."""
+    world = make_world(robots=2)
+    odometry = {
+        robot: [replace(piece, turn_rad=2.0 * piece.turn_rad) for piece in pieces]
+        for robot, pieces in world.runs[0].odometry.items()
+    }
+    mapped = build_map(world.team, [world.runs[0]._replace(odometry=odometry)], Request({}))
+    told = [note for note in mapped.notes if "reads other than its settings say: turns" in note]
+    assert len(told) == 2
