@@ -120,7 +120,7 @@ compiled: setup
 test-bench: setup compiled
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev,bench]'
 	$(BIN)/pytest -q tests/benchmarks/test_contenders.py tests/benchmarks/test_compiled.py \
-	  tests/benchmarks/test_viewers.py tests/launch/lab/test_seeds.py
+	  tests/benchmarks/test_viewers.py tests/benchmarks/test_mapping.py tests/launch/lab/test_seeds.py
 
 # Timed, so alone on the machine: the localizer's variants and their peers in the same run, then a
 # robot's detector and OpenCV's marker detection.

@@ -7,6 +7,7 @@ for them, and its own robust loss. `--team` also runs the team on the map, and o
 """
 
 import argparse
+import importlib.util
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -24,9 +25,10 @@ from cpcbl_launch.mapping.runs import read_runs, surveyed_landmarks
 from cpcbl_launch.reporting.metrics import Floats
 from cpcbl_launch.run.logged_team import LoggedTeam, builtin_for, load_logged_team
 from cpcbl_launch.team.file import find_team
-from cpcbl_team.config import Field, Landmark
+from cpcbl_team.config import Field, Landmark, Team
 
 CAUCHY_SIGMAS = 3.0
+OURS, GTSAM = "calibrate map", "GTSAM"
 
 
 class MapFigures(NamedTuple):
@@ -98,18 +100,18 @@ def _add_reading(gtsam: Any, graph: Any, mark: Any, row: tuple[Any, ...]) -> Non
         graph.add(factor(pose, int(mate), gtsam.Rot2(bearing), range_m, noise))
 
 
-def compare(folder: Path, known: Sequence[str]) -> tuple[Mapped, dict[str, MapFigures]]:
-    """The map of one log by both."""
-    team, survey = find_team(builtin_for(folder)), surveyed_landmarks([folder])
-    runs = read_runs([folder], [folder.name])
+def compare(folder: Path, known: Sequence[str], team: Team) -> tuple[Mapped, dict[str, MapFigures]]:
+    """The map of one log, and the figures of both; of GTSAM where it is installed."""
+    survey, runs = surveyed_landmarks([folder]), read_runs([folder], [folder.name])
     begin = process_time()
     mapped = build_map(team, runs, Request({name: survey[name] for name in known}))
     ours_s = process_time() - begin
     places = mapped.problem.parts(mapped.solution.x)[1]
-    found = {"calibrate map": figures(mapped, places, survey, ours_s, True)}
-    begin = process_time()
-    theirs = gtsam_places(mapped.problem, mapped.first_x)
-    found["GTSAM"] = figures(mapped, theirs, survey, process_time() - begin, False)
+    found = {OURS: figures(mapped, places, survey, ours_s, True)}
+    if importlib.util.find_spec("gtsam") is not None:
+        begin = process_time()
+        theirs = gtsam_places(mapped.problem, mapped.first_x)
+        found[GTSAM] = figures(mapped, theirs, survey, process_time() - begin, False)
     return mapped, found
 
 
@@ -141,14 +143,15 @@ def main() -> None:
     parser.add_argument("--team", action="store_true")
     arguments = parser.parse_args()
     for folder in arguments.folders:
-        mapped, found = compare(folder, arguments.known.split(","))
+        team = find_team(builtin_for(folder))
+        mapped, found = compare(folder, arguments.known.split(","), team)
         for name, f in found.items():
             show(
                 f"{folder.name} {name:14} mean {f.mean_m:.4f} m, worst {f.worst_m:.4f} m,"
                 f" NEES {f.nees:.2f}, {f.cpu_s:.1f} s of CPU time"
             )
         if arguments.team:
-            logged = load_logged_team(find_team(builtin_for(folder)), folder)
+            logged = load_logged_team(team, folder)
             survey = logged.team.map.landmarks
             on_survey = team_rmse_m(logged, survey)
             on_map = team_rmse_m(logged, mapped_landmarks(mapped, survey))
