@@ -61,9 +61,7 @@ WAYS = {
         instead=("mrclam MRCLAM6 --known 6,20", "mrclam-uncalibrated MRCLAM6 --known 6,8"),
         shows=("landmarks from MRCLAM6",),
     ),
-    "cpcbl-team calibrate map team.toml run --known door,east --picture map.png": Way(
-        "written: team.toml"
-    ),
+    "cpcbl-team calibrate map team.toml run --known door,east": Way("written: team.toml"),
     "cpcbl-team calibrate sensor lab.toml --pictures shots/ --poses poses.csv --robot rover1": Way(
         "written: lab.toml", "trial", shows=("ranges, errors in",)
     ),

@@ -6,7 +6,7 @@ of the sightings that are used, and so often in between that motions stay short.
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -76,8 +76,10 @@ class Drives(NamedTuple):
 def build_drives(team: Team, runs: Sequence[RunInputs], ignored: Iterable[str] = ()) -> Drives:
     """The drives of all runs. `ignored`: names of objects whose sightings are not used."""
     drives, left_out, notes = list[Drive](), Counter[str](), list[str]()
+    named = {robot for run in runs for robot in (*run.odometry, *run.frames)}
+    strangers = named - set(team.robots)  # guests, which are seen, too
     for run in runs:
-        found, lost, remarks = _drives_of_run(team, run, frozenset(ignored))
+        found, lost, remarks = _drives_of_run(team, run, strangers.union(ignored))
         drives += found
         left_out += lost
         notes += remarks
@@ -92,7 +94,7 @@ def natural(name: str) -> tuple[int, int, str]:
 
 
 def _drives_of_run(
-    team: Team, run: RunInputs, ignored: frozenset[str]
+    team: Team, run: RunInputs, ignored: Collection[str]
 ) -> tuple[list[Drive], Counter[str], list[str]]:
     left_out, notes = Counter[str](), list[str]()
     odometry: dict[str, list[Odometry]] = {}
@@ -125,7 +127,7 @@ def _used_sightings(
     team: Team,
     robot: str,
     frames: Iterable[Sightings],
-    ignored: frozenset[str],
+    ignored: Collection[str],
     left_out: Counter[str],
 ) -> list[tuple[int, Sighting, float]]:
     """The corrected sightings of one robot that are used: stamp (ns), sighting, inflation."""
@@ -149,10 +151,10 @@ def _used_sightings(
 
 
 def _reason_against(
-    team: Team, robot: str, sighting: Sighting, is_robot: bool, ignored: frozenset[str]
+    team: Team, robot: str, sighting: Sighting, is_robot: bool, ignored: Collection[str]
 ) -> str:
     if sighting.id in ignored:
-        return "of objects that are left out"
+        return "of robots that are not in the team"
     if sighting.id in team.map.walls:
         return "of walls, which this command does not estimate"
     sensor = team.robots[robot].sensor

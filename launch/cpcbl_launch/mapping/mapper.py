@@ -141,6 +141,8 @@ def _finished(
     problem = with_noise(first.problem, noise)
     progress(0.6)
     solution = solve(problem, rough.x, CONVERGED_M)
+    if set(first.names) <= first.frame.known.keys():
+        notes = (*notes, "no landmark is new: choose with --known or --withhold what is estimated")
     notes = (*notes, *_unusual(first.drives, problem.parts(solution.x)[2], request.errors))
     if not solution.converged:
         notes = (*notes, f"least squares did not converge in {solution.iterations} steps")

@@ -42,7 +42,11 @@ def estimate_noise(problem: Problem, solution: Solution, seed: int = 0) -> Noise
     left = _left_shares(problem, solution, seed)
     factors, correlation = np.full_like(left, np.nan), np.full_like(left, np.nan)
     errors, readings = reading_blocks(problem, solution.x).residuals, problem.readings
-    weight, measured, objects = solution.weights.readings**2, _measured(problem), _objects(problem)
+    weight, measured, objects = (
+        solution.weights.readings**2,
+        _has_reading(problem),
+        _objects(problem),
+    )
     for drive in range(problem.drives):
         for kind in (RANGE, BEARING):
             mine = (readings.drive == drive) & measured[:, kind]
@@ -58,7 +62,7 @@ def estimate_noise(problem: Problem, solution: Solution, seed: int = 0) -> Noise
     return Noise(factors, correlation, left)
 
 
-def _measured(problem: Problem) -> Mask:
+def _has_reading(problem: Problem) -> Mask:
     """Which ranges and bearings were measured, shape (s, 2)."""
     readings = problem.readings
     return np.isfinite(np.stack([readings.range_m, readings.bearing], axis=1))
@@ -72,7 +76,7 @@ def _left_shares(problem: Problem, solution: Solution, seed: int) -> Floats:
     signs = np.random.default_rng(seed).choice((-1.0, 1.0), (len(linear.residuals), PROBES))
     smoothed = linear.jacobian @ equations.solve(linear.jacobian.T @ signs)
     leverage = np.mean(signs * smoothed, axis=1)
-    readings, measured = problem.readings, _measured(problem)
+    readings, measured = problem.readings, _has_reading(problem)
     first = 3 * len(problem.motions.pose)
     of_readings = leverage[first : first + 2 * len(readings.pose)].reshape(-1, 2)
     result = np.ones((problem.drives, 2))

@@ -15,9 +15,14 @@ from scipy.sparse.linalg import splu
 from cpcbl_launch.calibration.statistics import Integers
 from cpcbl_launch.mapping.problem import Linearized, Problem
 from cpcbl_launch.reporting.metrics import Floats
+from cpcbl_team.errors import InputError
 
 MANY_READINGS = 300  # of one pose, from which on it belongs to the border
 CHUNK = 64  # columns of the border that are eliminated at a time
+UNDETERMINED = (
+    "calibrate map: these runs do not determine all places and paths; record a longer drive, with"
+    " landmarks in sight"
+)
 LEAST_INFORMATION = 1e-9  # of every unknown, in its unit^-2: a sigma of 30 km
 
 
@@ -34,29 +39,39 @@ def elimination_order(problem: Problem) -> tuple[Integers, Integers]:
     return inner, np.concatenate([standing, rest])
 
 
+class UndeterminedError(InputError):
+    """The measurements do not determine all unknowns."""
+
+
 class NormalEquations:
     """J^T J of a linearized problem, with each diagonal element times 1 + damping."""
 
     def __init__(
         self, linear: Linearized, order: tuple[Integers, Integers], damping: float
     ) -> None:
-        """Raises RuntimeError, LinAlgError where the unknowns are not determined."""
+        """Raises UndeterminedError."""
         self._inner, self._border = order
         hessian: Any = (linear.jacobian.T @ linear.jacobian).tocsr()
         diagonal = hessian.diagonal()
         hessian = hessian + sparse.diags(damping * diagonal + LEAST_INFORMATION)
         rows = hessian[self._inner]
         poses = rows[:, self._inner].tocsc()
-        self._factors = splu(
-            poses, permc_spec="NATURAL", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
-        )
+        try:
+            self._factors = splu(
+                poses, permc_spec="NATURAL", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
+            )
+        except RuntimeError as error:  # singular
+            raise UndeterminedError(UNDETERMINED) from error
         self._coupling = rows[:, self._border].tocsc()
         complement = hessian[self._border][:, self._border].toarray()
         for first in range(0, len(self._border), CHUNK):
             part = slice(first, first + CHUNK)
             eliminated = self._factors.solve(self._coupling[:, part].toarray())
             complement[:, part] -= self._coupling.T @ eliminated
-        self._cholesky = scipy.linalg.cho_factor(0.5 * (complement + complement.T))
+        try:
+            self._cholesky = scipy.linalg.cho_factor(0.5 * (complement + complement.T))
+        except (np.linalg.LinAlgError, ValueError) as error:  # not positive definite, not finite
+            raise UndeterminedError(UNDETERMINED) from error
 
     def solve(self, right: Floats) -> Floats:
         """The unknowns (n,) or (n, k) with H @ unknowns = right."""

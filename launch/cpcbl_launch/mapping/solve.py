@@ -8,9 +8,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cpcbl_launch.mapping.normal_equations import NormalEquations, elimination_order
+from cpcbl_launch.calibration.statistics import Integers
+from cpcbl_launch.mapping.normal_equations import (
+    NormalEquations,
+    UndeterminedError,
+    elimination_order,
+)
 from cpcbl_launch.mapping.problem import (
     CONSTANTS,
+    Linearized,
     Problem,
     Weights,
     linearize,
@@ -64,7 +70,7 @@ def solve(problem: Problem, start: Floats, least_step_m: float = CONVERGED_M) ->
         linear = linearize(problem, x, weights)
         gradient = linear.jacobian.T @ linear.residuals
         while True:
-            step = -NormalEquations(linear, order, damping).solve(gradient)
+            step = _step(linear, order, damping, gradient)
             trial_weights, trial_cost = robust_weights(problem, x + step)
             if trial_cost <= cost or damping > MOST_DAMPING:
                 break
@@ -83,6 +89,19 @@ def solved_equations(problem: Problem, solution: Solution) -> NormalEquations:
     """The normal equations at the solution, whose inverse is the covariance of all unknowns."""
     linear = linearize(problem, solution.x, solution.weights)
     return NormalEquations(linear, elimination_order(problem), 0.0)
+
+
+def _step(
+    linear: Linearized, order: tuple[Integers, Integers], damping: float, gradient: Floats
+) -> Floats:
+    """The step with this damping; none where the equations need more of it. Raises
+    UndeterminedError where none is enough."""
+    try:
+        return -NormalEquations(linear, order, damping).solve(gradient)
+    except UndeterminedError:
+        if damping > MOST_DAMPING:
+            raise
+        return np.full_like(gradient, np.nan)
 
 
 class Covariances(NamedTuple):

@@ -16,6 +16,7 @@ from cpcbl_team.errors import InputError
 from cpcbl_team.inputs import Sighting
 
 KNOWN = ("door", "lamp")
+MARKS_KNOWN = {name: Landmark(x_m=x, y_m=y) for name, (x, y) in MARKS.items()}
 
 
 def mapped_with(change: Change, range_m: float = 9.0) -> Mapped:
@@ -174,3 +175,15 @@ def test_settings_that_do_not_fit_are_named() -> None:
     mapped = build_map(world.team, [world.runs[0]._replace(odometry=odometry)], Request({}))
     told = [note for note in mapped.notes if "reads other than its settings say: turns" in note]
     assert len(told) == 2
+
+
+def test_a_guest_is_no_landmark_and_a_map_that_is_known_says_so() -> None:
+    world = make_world(robots=3, seconds=20.0)
+    members = {name: world.team.robots[name] for name in ("r1", "r2")}
+    mapped = build_map(replace(world.team, robots=members), world.runs, Request(MARKS_KNOWN))
+    assert set(mapped.names) == set(MARKS)
+    assert mapped.left_out["of robots that are not in the team"] > 0
+    assert mapped.notes == (
+        "day1: robot r3 is not in the team, so it is not used",
+        "no landmark is new: choose with --known or --withhold what is estimated",
+    )
