@@ -9,7 +9,7 @@ export PYTHONDONTWRITEBYTECODE =
 
 .PHONY: setup demo test quick check unit test-long test-recordings test-ros2 test-trial test-compiled test-docker test-bench \
   chaos net recording fuzz luck compiled bench bench-degraded bench-detection bench-latency bench-pictures \
-  bench-processes bench-scaling bench-view bench-pairs screenshot clean
+  bench-processes bench-scaling bench-view bench-pairs bench-mapping screenshot clean
 
 setup: $(VENV)/ready
 
@@ -120,7 +120,7 @@ compiled: setup
 test-bench: setup compiled
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev,bench]'
 	$(BIN)/pytest -q tests/benchmarks/test_contenders.py tests/benchmarks/test_compiled.py \
-	  tests/benchmarks/test_viewers.py tests/launch/lab/test_seeds.py
+	  tests/benchmarks/test_viewers.py tests/benchmarks/test_mapping.py tests/launch/lab/test_seeds.py
 
 # Timed, so alone on the machine: the localizer's variants and their peers in the same run, then a
 # robot's detector and OpenCV's marker detection.
@@ -143,6 +143,11 @@ bench-degraded: setup
 	@mkdir -p build
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev,bench]'
 	PYTHONPATH=$(BENCH_PATH) $(BIN)/python -m benchmarks.degraded $(ARGS)
+
+# `calibrate map` beside GTSAM; ARGS='MRCLAM2 MRCLAM4 --known 6,20 --team'.
+bench-mapping: setup
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev,bench]'
+	PYTHONPATH=$(BENCH_PATH) $(BIN)/python -m benchmarks.mapping $(ARGS)
 
 # The view with teams of 4, 50 and 200 robots in Chromium; docs/view.png, a picture of the demo, and
 # docs/report.png, of its report (ARGS=report: that alone).

@@ -56,6 +56,12 @@ WAYS = {
     "cpcbl-team calibrate colours lab.toml pictures/ --samples samples.csv": Way(
         "written: lab.toml"
     ),
+    "cpcbl-team calibrate map mrclam MRCLAM6 --known 6,20 --dry-run": Way(
+        r"\[map.landmarks.9\]",
+        instead=("mrclam MRCLAM6 --known 6,20", "mrclam-uncalibrated MRCLAM6 --known 6,8"),
+        shows=("landmarks from MRCLAM6",),
+    ),
+    "cpcbl-team calibrate map team.toml run --known door,east": Way("written: team.toml"),
     "cpcbl-team calibrate sensor lab.toml --pictures shots/ --poses poses.csv --robot rover1": Way(
         "written: lab.toml", "trial", shows=("ranges, errors in",)
     ),

@@ -151,6 +151,7 @@ MAKERS: dict[str, Callable[[Path], object]] = {
     "drive.mp4": _film,
     "router.json5": _router_config,
     "--re": _keys,  # --renew, --revoke
+    "map team.toml run ": _run,
     **dict.fromkeys([f"{word} run" for word in READERS_OF_RUNS], _run),
 }
 

@@ -95,7 +95,8 @@ def team_source(path: Path, output: Path | None) -> tuple[str, Path]:
 
 def edit_team(text: str, name: str, tables: Tables) -> str:
     """The text of a team file with these values in these tables. Raises TeamFileError. `name` is
-    the file's name in errors. A robot or type must exist; other tables are added."""
+    the file's name in errors. A robot or type must exist; other tables are added. A landmark that
+    has a place now is no longer one that nobody has surveyed."""
     try:
         document = tomlkit.parse(text)
     except tomlkit.exceptions.TOMLKitError as error:
@@ -115,13 +116,27 @@ def edit_team(text: str, name: str, tables: Tables) -> str:
                 table[part] = tomlkit.inline_table() if isinstance(table, InlineTable) else empty
             table = table[part]
         fresh = isinstance(table, Table) and not len(table)
-        for key, value in values.items():
+        for key, value in {**_taken_over(document, table_path), **values}.items():
             table[key] = _item(value, table)
         if fresh:
             table.add(tomlkit.nl())
     changed = tomlkit.dumps(document)
     parse_team(changed, name)
     return changed
+
+
+def _taken_over(document: Any, table_path: TablePath) -> dict[str, TomlValue]:
+    """What a landmark keeps of its entry among those that nobody has surveyed, which is taken
+    out; and its former covariance is void."""
+    *table, name = table_path.names
+    if table != ["map", "landmarks"]:
+        return {}
+    document["map"]["landmarks"][name].pop("covariance_m2", None)
+    unsurveyed = document["map"].get("unsurveyed", {})
+    former = unsurveyed.pop(name, {})
+    if not unsurveyed:
+        document["map"].pop("unsurveyed", None)
+    return {key: TomlValue(former[key]) for key in ("gives", "colours") if key in former}
 
 
 def tables_text(tables: Tables) -> str:

@@ -2,6 +2,7 @@
 
 from functools import partial
 from pathlib import Path
+from time import perf_counter
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from rich.console import Console
@@ -13,12 +14,13 @@ from cpcbl_launch.commands.measuring import calibrate
 from cpcbl_launch.commands.options import AsJson, print_not_written, print_result
 from cpcbl_launch.reporting.files import write_or_reason
 from cpcbl_launch.team.file import find_team
-from cpcbl_launch.team.requirements import require_opencv
+from cpcbl_launch.team.requirements import require_opencv, require_scipy
 from cpcbl_team.errors import InputError
 
 if TYPE_CHECKING:
     from cpcbl_launch.calibration.camera_accuracy import CameraDataset
     from cpcbl_launch.calibration.team_tables import Tables
+    from cpcbl_launch.mapping.mapper import Mapped
 
 LOG = "log"
 
@@ -97,6 +99,32 @@ Observer = Annotated[
     str | None, Option(help="Robot whose camera it is; default: all with a camera.")
 ]
 IntoType = Annotated[str | None, Option("--type", help="Write into this type, not into the robot.")]
+MapRuns = Annotated[
+    list[Path],
+    Argument(
+        metavar="[TEAM] RUN",
+        help=f"Recorded runs (folders, .mcap) or MRCLAM folders, of any days.{INTO}",
+    ),
+]
+Known = Annotated[
+    str,
+    Option(
+        help="Landmarks whose places in TEAM (or the log) fix the frame, e.g. 6,20, or none."
+        " Default: all without sigma_m."
+    ),
+]
+Withhold = Annotated[str, Option(help="Landmarks that are estimated although they are known.")]
+StartOf = Annotated[
+    str, Option("--start", help="Robot whose start in TEAM fixes the frame, without known places.")
+]
+PlaceSigma = Annotated[
+    float, Option(min=0.0, help="How far a landmark seems to be from its measured place: σ.")
+]
+PathFolder = Annotated[
+    Path | None,
+    Option(callback=options.folder, help="Folder to write the robots' paths into (TUM files)."),
+]
+DryRun = Annotated[bool, Option("--dry-run", help="Print what would be written into TEAM.")]
 
 
 @calibrate_app.command("camera")
@@ -224,6 +252,63 @@ def sensor(
     print_result(accuracy, as_json, lambda: print_camera_accuracy(accuracy, dataset, Console()))
     tables = sensor_tables(accuracy, dataset.camera, *paths)
     print_not_written(_save(tables, team_file, output, as_json))
+
+
+@calibrate_app.command("map")
+def landmark_map(
+    words: MapRuns,
+    known: Known = "",
+    withhold: Withhold = "",
+    start: StartOf = "",
+    place_sigma_m: PlaceSigma = 0.006,
+    output: ToFile = None,
+    dry_run: DryRun = False,
+    picture: options.PictureFile = None,
+    export: PathFolder = None,
+    as_json: AsJson = False,
+) -> None:
+    """Places of landmarks, and the robots' paths, from runs of one or more robots and days."""
+    require_scipy("calibrate map")
+    from cpcbl_launch.mapping.command import map_runs
+    from cpcbl_launch.mapping.report import map_report, map_tables, print_map
+    from cpcbl_launch.recordings.merge import recording_files
+    from cpcbl_launch.run.logged_team import builtin_for, file_for
+    from cpcbl_launch.views.run import progress_bar
+
+    team_file, runs = options.team_and_files(words)
+    if not runs:
+        raise InputError("calibrate map: name recorded runs, or MRCLAM folders, after the team")
+    if not dry_run:
+        _check_target(team_file, output)
+    names = [run.resolve().name for run in runs]
+    wanted = options.parse_names(known), options.parse_names(withhold), start, place_sigma_m
+    with recording_files(runs) as files, progress_bar("mapping", quiet=as_json) as progress:
+        is_recorded = files[0].suffix == ".mcap"
+        team_path = None if is_recorded else builtin_for(files[0])
+        if team_file is not None:
+            team_path = team_file if is_recorded else file_for(team_file, files[0])
+        begin_s = perf_counter()
+        team = None if team_path is None else find_team(team_path)
+        mapped = map_runs(team, files, names, *wanted, progress)
+    result = map_report(mapped, names, perf_counter() - begin_s)
+    print_result(result, as_json, lambda: print_map(result, Console()))
+    lost = _write_map_files(mapped, picture, export)
+    target = None if dry_run else team_file
+    print_not_written(lost | _save(map_tables(result), target, output, as_json))
+
+
+def _write_map_files(mapped: "Mapped", picture: Path | None, export: Path | None) -> dict[str, str]:
+    """Writes what `--picture` and `--export` ask for; files not written, with the reason."""
+    from cpcbl_launch.mapping.command import export_paths
+
+    lost: dict[str, str] = {}
+    if picture is not None:
+        from cpcbl_launch.mapping.plots import draw_map
+
+        lost |= write_or_reason(picture, partial(draw_map, mapped, picture))
+    if export is not None:
+        lost |= write_or_reason(export, partial(export_paths, mapped, export))
+    return lost
 
 
 def _dataset_from_pictures(

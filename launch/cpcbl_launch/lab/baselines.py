@@ -17,20 +17,19 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from msgspec.structs import replace
 
 from cpcbl_agents.agent import Tick
 from cpcbl_agents.robot import build_robot
+from cpcbl_launch.mapping.odometry_track import OdometryTrack
 from cpcbl_launch.reporting.metrics import Floats, Trajectory
 from cpcbl_launch.run.logged_team import LoggedTeam
 from cpcbl_team import sensors
 from cpcbl_team.config import Field, LocalizationSettings, SensorSettings
 from cpcbl_team.constraints import NEAREST_M
-from cpcbl_team.estimate import ZERO3, Covariance3, Estimate
+from cpcbl_team.estimate import Covariance3, Estimate
 from cpcbl_team.fusion import chi_square_bounds
-from cpcbl_team.geometry import Pose2, wrap_angle
+from cpcbl_team.geometry import wrap_angle
 from cpcbl_team.inputs import Odometry, Sighting, Sightings
-from cpcbl_team.localizer import Localizer
 from cpcbl_team.object_timers import ObjectTimers
 from cpcbl_team.state import Updates
 
@@ -106,27 +105,6 @@ def expected_sighting(pose: Floats, place: Floats) -> tuple[Floats, Floats]:
     return np.array([r, wrap_angle(math.atan2(dy, dx) - pose[2])]), jacobian
 
 
-class OdometryTrack:
-    """One robot's odometry, read once from the start to the end.
-
-    The team's localizer moves along it: gaps are bridged as the team does it.
-    """
-
-    def __init__(self, inputs: BaselineInputs) -> None:
-        rules = replace(inputs.settings.localizer, variant="joint", self_calibration=False)
-        self._localizer = Localizer(replace(inputs.settings, localizer=rules), Field())
-        self._state = self._localizer.start(inputs.start_ns)
-        self._pieces = deque(sorted(inputs.odometry, key=lambda piece: piece.from_ns))
-
-    def until(self, until_ns: int) -> Estimate:
-        """The motion since the last call: the new pose in the frame of the old one (m, rad)."""
-        state = self._state._replace(estimate=Estimate(Pose2(0.0, 0.0, 0.0), ZERO3))
-        while self._pieces and self._pieces[0].from_ns < until_ns:
-            state = self._localizer.add_odometry(state, self._pieces.popleft())
-        self._state = self._localizer.predict(state, until_ns)
-        return self._state.estimate
-
-
 def compose(pose: Floats, motion: Estimate) -> tuple[Floats, Floats, Floats]:
     """The pose after a motion, its Jacobian by the pose before, and the noise; field's frame."""
     c, s = math.cos(pose[2]), math.sin(pose[2])
@@ -190,7 +168,7 @@ class RobotBlock:
         self.columns = [first, first + 1, first + 2]  # of x, y, heading
         self.block = slice(first, first + 3)
         self.settings = inputs.settings
-        self.odometry = OdometryTrack(inputs)
+        self.odometry = OdometryTrack(inputs.settings, inputs.start_ns, inputs.odometry)
         self.timers = ObjectTimers(inputs.settings)
         self.used_ns: dict[str, int] = {}
         self.uses = Updates(objects_ns=self.used_ns)

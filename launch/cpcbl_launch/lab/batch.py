@@ -16,13 +16,13 @@ import numpy as np
 from cpcbl_launch.lab.baselines import (
     SMALLEST_VARIANCE,
     BaselineInputs,
-    OdometryTrack,
     as_matrix,
     as_trajectory,
     compose,
     linearize,
     run_ekf,
 )
+from cpcbl_launch.mapping.odometry_track import OdometryTrack
 from cpcbl_launch.reporting.metrics import Floats, Trajectory
 from cpcbl_launch.simulation.in_process import Progress
 from cpcbl_team.config import Field
@@ -69,7 +69,7 @@ def smooth(
     first = run_ekf(inputs, field, dict.fromkeys(inputs, times))
     path = np.stack([np.array(first[name].estimate) for name in inputs], axis=1)
     path[..., 2] = np.unwrap(path[..., 2], axis=0)
-    tracks = [OdometryTrack(robot) for robot in inputs.values()]
+    tracks = [OdometryTrack(r.settings, r.start_ns, r.odometry) for r in inputs.values()]
     motions = [[track.until(stamp_ns) for track in tracks] for stamp_ns in times]
     frames = [used.get(stamp_ns, []) for stamp_ns in times]
     for done in range(PASSES):
@@ -207,7 +207,8 @@ def _between(
 ) -> Trajectory:
     """The estimates of one robot at these stamps, by odometry from the time before each."""
     smoothed = dict(zip(times, zip(poses, covariances, strict=True), strict=True))
-    track, wanted, estimates = OdometryTrack(robot), set(stamps_ns), []
+    track = OdometryTrack(robot.settings, robot.start_ns, robot.odometry)
+    wanted, estimates = set(stamps_ns), []
     pose, covariance = smoothed[times[0]]
     for stamp_ns in sorted({*times, *wanted}):
         moved, jacobian, noise = compose(pose, track.until(stamp_ns))

@@ -213,12 +213,13 @@ def export_tum(
     """
     for kind, robots in paths.items():
         for name, path in robots.items():
-            _write_tum(folder / f"{name}_{kind}.tum", path.stamps_ns, path.estimate)
+            write_tum(folder / f"{name}_{kind}.tum", path.stamps_ns, path.estimate)
             stamps_ns, samples = samples_with_truth(path, truth.get(name))
-            _write_tum(folder / f"{name}_truth.tum", stamps_ns, samples.truth)
+            write_tum(folder / f"{name}_truth.tum", stamps_ns, samples.truth)
 
 
-def _write_tum(path: Path, stamps_ns: Stamps, poses: Floats) -> None:
+def write_tum(path: Path, stamps_ns: Stamps, poses: Floats) -> None:
+    """Writes poses (n, 3): x m, y m, heading rad; at these stamps (n,)."""
     lines = [
         f"{ns // 10**9}.{ns % 10**9:09d} {x:.9f} {y:.9f} 0 0 0"
         f" {math.sin(0.5 * heading):.9f} {math.cos(0.5 * heading):.9f}\n"

@@ -50,6 +50,12 @@ def require_opencv(what: str) -> None:
         raise DependencyError(f"{what} needs OpenCV: {install_command('camera')}")
 
 
+def require_scipy(what: str) -> None:
+    """Raises DependencyError where SciPy is not installed."""
+    if importlib.util.find_spec("scipy") is None:
+        raise DependencyError(f"{what} needs SciPy: {install_command('map')}")
+
+
 def require_team_opencv(team: Team, robots: Collection[str] = (), field: bool = False) -> None:
     """Raises DependencyError where these robots, or the simulated field, need OpenCV in vain."""
     seeing = [f"robots.{name}" for name in team.cameras if name in robots]
