@@ -13,7 +13,8 @@ class CpcblError(Exception):
         ├── InputError          an option, an argument or a file of the user
         │   ├── TeamFileError   a team file (cpcbl_launch.team.file)
         │   ├── LogError        a log or a recording (cpcbl_agents.sources.mrclam)
-        │   └── RosNameError    a name that ROS 2 does not allow (cpcbl_transport.ros2)
+        │   ├── RosNameError    a name that ROS 2 does not allow (cpcbl_transport.ros2)
+        │   └── UndeterminedError   drives that give no map (cpcbl_launch.mapping)
         ├── DependencyError     a package or a system that this machine does not have
         ├── ClockError          the machine's clock was set while a robot ran
         ├── BusError            no router, or a router that cannot listen (cpcbl_transport)

@@ -98,6 +98,9 @@ WAYS = {
     "cpcbl-team evaluate mrclam MRCLAM6 --blind 3,4,5 --collaboration none": Way("RMSE m"),
     "cpcbl-team evaluate mrclam MRCLAM6 --blind 3,4,5 --yardstick": Way("centralized EKF"),
     "cpcbl-team evaluate mrclam MRCLAM6 --blind 3,4,5 --yardstick batch": Way("batch"),
+    "cpcbl-team evaluate mrclam MRCLAM6 --known-landmarks 6,20": Way(
+        "RMSE m", instead=("6,20", "6,8")
+    ),
     "cpcbl-team experiment budget --team-size 5 --world chain --seeds 6": BUDGET,
     "cpcbl-team experiment budget --world chain": BUDGET,
     "cpcbl-team experiment budget MRCLAM6": Way(EXPERIMENT, "long"),
@@ -115,6 +118,9 @@ WAYS = {
     "cpcbl-team experiment table1": Way(EXPERIMENT, "long", "--seeds 1", shows=TABLE_1),
     "cpcbl-team experiment table1 --seeds 20": Way(EXPERIMENT, "long", "--seeds 2"),
     "cpcbl-team experiment worlds": Way(EXPERIMENT, "long", "--seeds 1"),
+    "cpcbl-team experiment worlds --worlds uncertain,unsurveyed": Way(
+        EXPERIMENT, "long", "--seeds 1"
+    ),
     "cpcbl-team bridge access team.toml > access.json5": Way("access_control"),
     "cpcbl-team bridge ros2 team.toml": LIVE._replace(says="in ROS 2 at", beside="router"),
     "cpcbl-team gateway team.toml": LIVE._replace(

@@ -7,6 +7,7 @@ import pytest
 
 import cpcbl_launch.lab.chaos.scenario
 import cpcbl_launch.lab.chaos.team
+import cpcbl_launch.mapping.normal_equations
 import cpcbl_launch.run.containers.docker
 import cpcbl_launch.team.file  # noqa: F401  these modules define the errors of the tree
 from cpcbl_agents.clock import Clock

@@ -96,7 +96,8 @@ def without_unknowable(log: RunLog, history: History, team: Team) -> RunLog:
     """The log without the tracks of robots that said that they were lost, and without those of
     times of which no robot can know that its inputs or its help are wrong."""
     settling_s = max(SETTLING_S, frames_s(team))
-    spans = [(e.from_s, e.until_s + settling_s) for e in history.of_kind(*UNKNOWABLE)]
+    step_s = 1.0 / team.simulation.step_rate_hz  # truth between two steps is no pose where it jumps
+    spans = [(e.from_s - step_s, e.until_s + settling_s) for e in history.of_kind(*UNKNOWABLE)]
     tracks = {
         name: [
             t for t in tracks if not t.track.lost and not any(a <= t.stamp_s < b for a, b in spans)
