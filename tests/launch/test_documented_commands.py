@@ -26,8 +26,6 @@ from cpcbl_launch.run.up import free_endpoint
 
 ENDPOINT = re.compile(r"(?<=--connect )(tcp/[\d.:]+|ENDPOINT)")
 PATIENCE_S = 60.0
-
-
 WATCHED = LIVE._replace(says="watched for", beside="team.toml")
 BUDGET = Way(EXPERIMENT, "long", "--team-size 2 --seeds 1")
 SHORT = "--duration 12"
