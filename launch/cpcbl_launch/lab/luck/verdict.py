@@ -98,8 +98,8 @@ def frames_s(team: Team) -> float:
 
 def noticeable_s(log: RunLog, carried: Event) -> float:
     """From when a robot that is carried away can know it: when it has judged `NOTICED` measurements
-    since; at once for other events. A camera that faces no landmark shows nothing, and budgets limit how often teammates
-    report: both may take as long as the rest of the history."""
+    since; at once for other events. A camera that faces no landmark shows nothing, and budgets
+    limit how often teammates report: both may take as long as the rest of the history."""
     if carried.kind != "kidnap":
         return carried.from_s
     total = before = 0
