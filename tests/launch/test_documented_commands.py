@@ -16,7 +16,7 @@ from pathlib import Path
 
 import pytest
 from support.documented_files import write_files
-from support.documented_ways import ALIVE, LIVE, Way, Where
+from support.documented_ways import ALIVE, EXPERIMENT, KNOWN, LIVE, ONE_SEED, Way, Where
 from support.documents import ROOT, blocks, commands, headers
 from support.processes import command_line, eventually
 from support.programs import Program
@@ -26,10 +26,7 @@ from cpcbl_launch.run.up import free_endpoint
 
 ENDPOINT = re.compile(r"(?<=--connect )(tcp/[\d.:]+|ENDPOINT)")
 PATIENCE_S = 60.0
-
-
 WATCHED = LIVE._replace(says="watched for", beside="team.toml")
-EXPERIMENT = "written: "
 BUDGET = Way(EXPERIMENT, "long", "--team-size 2 --seeds 1")
 SHORT = "--duration 12"
 LEDGER = "run, 60 s", "what each was worth"
@@ -98,9 +95,7 @@ WAYS = {
     "cpcbl-team evaluate mrclam MRCLAM6 --blind 3,4,5 --collaboration none": Way("RMSE m"),
     "cpcbl-team evaluate mrclam MRCLAM6 --blind 3,4,5 --yardstick": Way("centralized EKF"),
     "cpcbl-team evaluate mrclam MRCLAM6 --blind 3,4,5 --yardstick batch": Way("batch"),
-    "cpcbl-team evaluate mrclam MRCLAM6 --known-landmarks 6,20": Way(
-        "RMSE m", instead=("6,20", "6,8")
-    ),
+    "cpcbl-team evaluate mrclam MRCLAM6 --known-landmarks 6,20": KNOWN,
     "cpcbl-team experiment budget --team-size 5 --world chain --seeds 6": BUDGET,
     "cpcbl-team experiment budget --world chain": BUDGET,
     "cpcbl-team experiment budget MRCLAM6": Way(EXPERIMENT, "long"),
@@ -109,7 +104,7 @@ WAYS = {
     "cpcbl-team experiment figure7-cameras": Way(
         EXPERIMENT, "long", "--seeds 1", shows=FIGURE_7[1:]
     ),
-    "cpcbl-team experiment liars": Way(EXPERIMENT, "long", "--seeds 1"),
+    "cpcbl-team experiment liars": ONE_SEED,
     "cpcbl-team experiment liars --seeds 4": Way(EXPERIMENT, "long", "--seeds 1", shows=LIAR),
     "cpcbl-team experiment luck": Way("histories", "trial", "--seeds 1 --duration 8 --jobs 1"),
     "cpcbl-team experiment one-way-vs-both": Way(
@@ -117,10 +112,8 @@ WAYS = {
     ),
     "cpcbl-team experiment table1": Way(EXPERIMENT, "long", "--seeds 1", shows=TABLE_1),
     "cpcbl-team experiment table1 --seeds 20": Way(EXPERIMENT, "long", "--seeds 2"),
-    "cpcbl-team experiment worlds": Way(EXPERIMENT, "long", "--seeds 1"),
-    "cpcbl-team experiment worlds --worlds uncertain,unsurveyed": Way(
-        EXPERIMENT, "long", "--seeds 1"
-    ),
+    "cpcbl-team experiment worlds": ONE_SEED,
+    "cpcbl-team experiment worlds --worlds uncertain,unsurveyed": ONE_SEED,
     "cpcbl-team bridge access team.toml > access.json5": Way("access_control"),
     "cpcbl-team bridge ros2 team.toml": LIVE._replace(says="in ROS 2 at", beside="router"),
     "cpcbl-team gateway team.toml": LIVE._replace(

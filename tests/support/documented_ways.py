@@ -20,5 +20,8 @@ class Way(NamedTuple):
     shows: tuple[str, ...] = ()  # beginnings of the outputs in the docs that have its tables
 
 
+EXPERIMENT = "written: "
+ONE_SEED = Way(EXPERIMENT, "long", "--seeds 1")
+KNOWN = Way("RMSE m", instead=("6,20", "6,8"))
 LIVE = Way("", "trial", until_sigint=True, codes=(ENDED_BY_SIGINT,))
 ALIVE = r" ok\b"  # the state of a robot in the live table

@@ -35,6 +35,8 @@ QUICK = (  # the worlds of the findings, each as short as it may be
     "helper with heading σ 20 deg",
     "landmarks 1 s in 10",
     "start unknown",
+    "uncertain map, 2 landmarks",
+    "unsurveyed, 0 of 8 known",
 )
 
 
@@ -68,14 +70,14 @@ def test_a_lost_robot_has_no_figures_but_that() -> None:
 
 
 def test_worlds_are_chosen_by_words() -> None:
-    chosen = cases(["2 landmarks range-only", "ring,"], ["joint", "oval"])
+    chosen = cases(["wide prior range-only", "uncertain map, ring,"], ["joint", "oval"])
     assert list(chosen) == [
-        ("2 landmarks range-only", "joint"),
-        ("2 landmarks range-only", "oval"),
-        ("ring, landmarks 1 s in 10", "joint"),
-        ("ring, landmarks 1 s in 10", "oval"),
+        ("wide prior range-only", "joint"),
+        ("wide prior range-only", "oval"),
+        ("uncertain map, ring, landmarks 1 s in 10", "joint"),
+        ("uncertain map, ring, landmarks 1 s in 10", "oval"),
     ]
-    assert chosen["2 landmarks range-only", "oval"].team.robots["r"].localizer.variant == "oval"
+    assert chosen["wide prior range-only", "oval"].team.robots["r"].localizer.variant == "oval"
 
 
 @pytest.mark.parametrize(
