@@ -4,6 +4,7 @@
 PYTHON ?= python3
 VENV ?= .venv
 BIN = $(VENV)/bin
+COMPILED = build/compiled
 # Where it is set, each process that the tests start compiles whatever it imports once more.
 export PYTHONDONTWRITEBYTECODE =
 
@@ -91,9 +92,10 @@ chaos: setup
 net: setup
 	PYTHONPATH=$(BENCH_PATH) $(BIN)/python -m net.reference
 
-# A day of team time with bad luck (docs/luck.md), with the compiled core if `make compiled` made it.
-luck: setup
-	PYTHONPATH=agents:transport:launch:$(COMPILED) $(BIN)/cpcbl-team experiment luck --seeds 1440 --output build
+# A day of team time with bad luck (docs/luck.md), with the compiled core, which is built anew only
+# when it is missing or older than its sources. ARGS='--seeds 200': a part of it.
+luck: $(COMPILED)/ready
+	PYTHONPATH=agents:transport:launch:$(COMPILED) $(BIN)/cpcbl-team experiment luck --seeds 1440 --output build $(ARGS)
 
 # Meaningless payloads on every key of a running team: some minutes.
 fuzz: setup
@@ -105,8 +107,9 @@ recording: setup
 
 # The core with its hot files compiled (hatch_build.py), and the benchmarks' yardstick: beside the
 # checkout's own, which stay as they are. Needs a C compiler.
-COMPILED = build/compiled
-compiled: setup
+compiled: $(COMPILED)/ready
+
+$(COMPILED)/ready: $(VENV)/ready hatch_build.py $(wildcard cpcbl_team/*.py cpcbl_team/config/*.py) tests/benchmarks/float_ekf.py
 	rm -rf $(COMPILED)
 	HATCH_BUILD_HOOKS_ENABLE=1 $(BIN)/python -m pip install --quiet --disable-pip-version-check \
 	  --no-deps --target $(COMPILED) .
@@ -114,6 +117,7 @@ compiled: setup
 	cp tests/benchmarks/float_ekf.py $(COMPILED)/benchmarks
 	cd $(COMPILED) && MYPYPATH=../../tests $(abspath $(BIN))/mypyc --namespace-packages \
 	  --explicit-package-bases --ignore-missing-imports benchmarks/float_ekf.py > mypyc.log
+	@touch $@
 
 # The variants of the localizer and their peers of the extra `bench` compute the same; so do a cluster
 # and this machine.

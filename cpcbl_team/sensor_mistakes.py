@@ -54,7 +54,7 @@ FIXED: Final = (
     " north, headings in place of turns, or wheels that slip"
 )
 IN_FEET: Final = "ranges look like feet"
-MISTAKES: Final = (
+MISTAKES: Final[tuple[SensorMistake, ...]] = (
     SensorMistake(MIRRORED, lambda p, h: p.conjugate()),
     SensorMistake(QUARTER_OFF, lambda p, h: p * 1j),
     SensorMistake(QUARTER_OFF, lambda p, h: p / 1j),

@@ -64,6 +64,11 @@ class ClockMonitor:
         late_s = min(last.least_ns, before.least_ns) * 1e-9
         return max(-LARGEST_NUMBER, min(late_s, LARGEST_NUMBER))
 
-    def off(self) -> frozenset[str]:
-        """The teammates whose clocks are off."""
-        return frozenset(name for name, spans in self._spans.items() if self._is_off(*spans))
+    def off(self, now_ns: int) -> frozenset[str]:
+        """The teammates whose clocks are off, by what came of them lately: of one that has been
+        silent for longer, nothing is known."""
+        return frozenset(
+            name
+            for name, spans in self._spans.items()
+            if now_ns - spans[0].since_ns < 2 * SPAN_NS and self._is_off(*spans)
+        )

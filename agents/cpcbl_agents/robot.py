@@ -204,7 +204,7 @@ class Robot:
     def _trust(self, now_ns: int, clocks: ClockMonitor | None) -> Iterator[Trust]:
         """How far each teammate is trusted, by its messages and by its clock."""
         statuses = {s.robot: s for s in self.filter.trust_statuses(now_ns)}
-        clock_off = frozenset() if clocks is None else clocks.off()
+        clock_off = frozenset() if clocks is None else clocks.off(now_ns)
         for name in sorted(statuses.keys() | clock_off):
             status = statuses.get(name, TrustStatus(name))
             if name in clock_off:

@@ -28,7 +28,7 @@ def heard(
 def test_a_clock_within_the_bounds_is_tolerated(late_ns: int) -> None:
     clocks = ClockMonitor(RULES)
     assert not any(heard(clocks, late_ns, 200))
-    assert clocks.off() == frozenset()
+    assert clocks.off(NOW) == frozenset()
     assert clocks.late_s("mate") == pytest.approx(late_ns * 1e-9)
 
 
@@ -37,7 +37,7 @@ def test_a_clock_beyond_them_is_found_and_refused(late_ns: int) -> None:
     clocks = ClockMonitor(RULES)
     refused = heard(clocks, late_ns, 20)
     assert all(refused[MIN_MESSAGES:])
-    assert clocks.off() == {"mate"}
+    assert clocks.off(NOW) == {"mate"}
     assert clocks.late_s("mate") == pytest.approx(late_ns * 1e-9)
 
 
@@ -71,7 +71,14 @@ def test_a_clock_that_was_set_right_is_believed_again(late_ns: int) -> None:
     heard(clocks, late_ns, 50)
     heard(clocks, 20 * MS, 2 * SPAN_NS // (100 * MS), NOW + 5 * SECOND)
     assert not any(heard(clocks, 20 * MS, 10, NOW + 5 * SECOND + 2 * SPAN_NS))
-    assert clocks.off() == frozenset()
+    assert clocks.off(NOW + 6 * SECOND + 2 * SPAN_NS) == frozenset()
+
+
+def test_of_a_mate_that_has_been_silent_nothing_is_said() -> None:
+    clocks = ClockMonitor(RULES)
+    heard(clocks, 900 * MS, MIN_MESSAGES)  # after a pause of this robot, say
+    assert clocks.off(NOW + 2 * SPAN_NS - 1) == {"mate"}
+    assert clocks.off(NOW + 2 * SPAN_NS) == frozenset()
 
 
 def test_a_clock_that_goes_wrong_is_found_within_two_spans() -> None:

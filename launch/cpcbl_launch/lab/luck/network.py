@@ -234,8 +234,9 @@ class _Publisher(PublisherProxy):
 
     @property
     def matching(self) -> bool:
-        is_cut = self._session.network.has_cuts
-        return self._publisher.matching and (not is_cut or self._session.reaches_any(self._key))
+        if not self._publisher.matching:
+            return False
+        return not self._session.network.has_cuts or self._session.reaches_any(self._key)
 
     def put(self, payload: bytes) -> None:
         network, own = self._session.network, self._session.name

@@ -1,5 +1,6 @@
 """What must hold of a whole history: claims, consistency, and that nobody waits for ever."""
 
+import math
 from collections.abc import Iterator
 
 import numpy as np
@@ -7,7 +8,7 @@ import numpy as np
 from cpcbl_launch.lab.chaos.consistency import Consistency, consistency
 from cpcbl_launch.lab.chaos.history import longest_false_claim_s
 from cpcbl_launch.lab.chaos.run_log import TRACKS_HZ, RunLog
-from cpcbl_launch.lab.luck.history import History, Kind
+from cpcbl_launch.lab.luck.history import Event, History, Kind
 from cpcbl_launch.lab.luck.processes import RESTART_S
 from cpcbl_launch.lab.luck.spending import budget_windows
 from cpcbl_launch.lab.luck.teams import is_blind
@@ -23,6 +24,7 @@ GAP_S = 0.4  # between two tracks, beside the time between two pieces of odometr
 FALSE_S, FALSE_M = 4.0, 0.5
 SETTLING_S = 10.0  # after an event of which no robot can know, its team is not judged
 FRAMES = 20  # of the slowest camera of a team, in which robots settle and are localized again
+NOTICED = 13  # measurements after which a robot that was carried away can know it (docs/luck.md)
 LEAST_S = 8.0  # of tracks, for a judgement
 UNKNOWABLE: tuple[Kind, ...] = ("liar", "clock-step", "kidnap", "odd-sightings", "lost-inputs")
 """What makes a robot's inputs or its help wrong in a way that its models do not have."""
@@ -56,8 +58,10 @@ def _waiting(log: RunLog, history: History, team: Team) -> Iterator[Violation]:
         gap_s = log.longest_track_gap_s(name, healed_s + 2.0, end_s)
         if quiet_s > 3.0 and gap_s > GAP_S + 1.0 / tracks_hz(team, name):
             yield Violation("nobody waits", name, end_s, f"no track for {gap_s:.1f} s")
-        after_s = log.localized_after_s(name, healed_s)
-        if quiet_s > back_s + 1.0 and (after_s is None or after_s > back_s):
+        carried = [e for e in history.of_kind("kidnap") if e.robot == name]
+        known_s = max([healed_s, *(noticeable_s(log, e) for e in carried)])
+        after_s = log.localized_after_s(name, known_s)
+        if min(quiet_s, end_s - known_s) > back_s + 1.0 and (after_s is None or after_s > back_s):
             text = "never" if after_s is None else f"only {after_s:.1f} s after the last event"
             yield Violation("nobody waits", name, end_s, f"it was localized {text}")
         if quiet_s > HELP_S and _misses_help(log, name, end_s):
@@ -92,12 +96,32 @@ def frames_s(team: Team) -> float:
     return FRAMES / min(robot.sensor.rate_hz for robot in team.robots.values())
 
 
+def noticeable_s(log: RunLog, carried: Event) -> float:
+    """From when a robot that is carried away can know it: when it has judged `NOTICED` measurements
+    since; at once for other events. A camera that faces no landmark shows nothing, and budgets
+    limit how often teammates report: both may take as long as the rest of the history."""
+    if carried.kind != "kidnap":
+        return carried.from_s
+    total = before = 0
+    for at_s, status in log.statuses.get(carried.robot, ()):
+        now = status.counts.get("accepted", 0) + status.counts.get("gated", 0)
+        if at_s >= carried.from_s + 1.0:
+            total += now - before if now >= before else now  # less: a new process counts
+        before = now
+        if total >= NOTICED:
+            return at_s
+    return math.inf
+
+
 def without_unknowable(log: RunLog, history: History, team: Team) -> RunLog:
     """The log without the tracks of robots that said that they were lost, and without those of
     times of which no robot can know that its inputs or its help are wrong."""
     settling_s = max(SETTLING_S, frames_s(team))
     step_s = 1.0 / team.simulation.step_rate_hz  # truth between two steps is no pose where it jumps
-    spans = [(e.from_s - step_s, e.until_s + settling_s) for e in history.of_kind(*UNKNOWABLE)]
+    spans = [
+        (e.from_s - step_s, max(e.until_s + settling_s, noticeable_s(log, e)))
+        for e in history.of_kind(*UNKNOWABLE)
+    ]
     tracks = {
         name: [
             t for t in tracks if not t.track.lost and not any(a <= t.stamp_s < b for a, b in spans)

@@ -1,0 +1,38 @@
+"""From when a robot that was carried away can be expected to know it."""
+
+import math
+
+import pytest
+from msgspec.structs import replace
+
+from cpcbl_launch.lab.chaos.run_log import RunLog
+from cpcbl_launch.lab.luck.history import Event
+from cpcbl_launch.lab.luck.verdict import NOTICED, noticeable_s
+from cpcbl_transport.messages import Status
+
+CARRIED = Event(0, "kidnap", "guide1", 10.0, 10.0, 2.0)
+STATUS = Status("guide1", "0", 0, 0.1, 0.1, 3, "", {}, 0, 0, 0, 0)
+
+
+def log_of(*judged: int) -> RunLog:
+    """The log of a robot that had judged so many measurements after each second."""
+    counts = ({"accepted": number // 2, "gated": number - number // 2} for number in judged)
+    statuses = [(float(s + 1), replace(STATUS, counts=c)) for s, c in enumerate(counts)]
+    return RunLog(0, {}, {"guide1": tuple(statuses)}, (), {})
+
+
+@pytest.mark.parametrize(
+    ("later", "known_s"),
+    [
+        ([50] * 10, math.inf),  # nothing that it could know it by
+        ([50] * 5 + [50 + NOTICED - 1, 50 + NOTICED], 17.0),
+        ([0] * 4 + [NOTICED], 15.0),  # a new process counts from zero
+    ],
+)
+def test_it_can_know_it_after_enough_measurements(later: list[int], known_s: float) -> None:
+    assert noticeable_s(log_of(*[5 * s for s in range(1, 10)], 50, *later), CARRIED) == known_s
+
+
+def test_other_events_wait_for_nothing() -> None:
+    loss = replace(CARRIED, kind="lost-inputs")
+    assert noticeable_s(log_of(*[50] * 20), loss) == loss.from_s
