@@ -118,7 +118,6 @@ class Node:
         self._pose = PoseOutput(robot, bus, team.robots[robot.name].pose_rate_hz, start_ns)
         self._tokens = LivelinessTokens()
         self._subscribed: dict[object, str] = {BeliefSubscribers: "", FrameSubscribers: ""}
-        self._subscriber_keys: dict[object, tuple[int | None, str]] = {}  # with their tier
         self._explained: set[tuple[str, Refusal]] = set()
         self._counts: Counter[str] = Counter()
         self.received = MessageCounters()
@@ -254,11 +253,7 @@ class Node:
         self, topic: Topic, event: type[BeliefSubscribers | FrameSubscribers], now_ns: int
     ) -> None:
         """Tells the robot when the subscribers to what it publishes under a topic come or go."""
-        tier = self._declarations.tier
-        known_tier, key = self._subscriber_keys.get(event, (None, ""))
-        if known_tier != tier:
-            key = topic.at(tier=tier, robot=self._name)
-            self._subscriber_keys[event] = tier, key
+        key = topic.at(tier=self._declarations.tier, robot=self._name)
         subscribed = key if self._declarations.publisher(topic, key).matching else ""
         if subscribed != self._subscribed[event]:  # another key may have other subscribers
             self._subscribed[event] = subscribed
