@@ -10,12 +10,13 @@ from cpcbl_team.estimate import (
     Covariance3,
     Estimate,
     Row,
+    dot,
     offset_pose,
     sharpest,
 )
 from cpcbl_team.fusion import Observation, best_weight
 from cpcbl_team.gaussian import Covariance2
-from cpcbl_team.parameters import Numbers, Parameters, Sensitivity, dot, sensitivity_dot
+from cpcbl_team.parameters import Numbers, Parameters, Sensitivity, sensitivity_dot
 
 
 class Reading(NamedTuple):
@@ -53,6 +54,17 @@ class AugmentedUpdate:
         self._offset: Row = (0.0, 0.0, 0.0)
         self._changes: Numbers = (0.0,) * len(common.values)
 
+    @property
+    def is_sound(self) -> bool:
+        """Whether rounding has left variances."""
+        return min(self.covariance.xx, self.covariance.yy, self.covariance.hh) >= 0.0
+
+    def after(self, readings: Iterable[Reading]) -> "AugmentedUpdate":
+        """This update, with these readings added."""
+        for reading in readings:
+            self.add(reading)
+        return self
+
     def add(self, reading: Reading) -> None:
         """One more reading."""
         h, c, residual, variance = reading
@@ -87,14 +99,12 @@ class AugmentedUpdate:
         """The estimate and the common errors after all readings. What of the estimate came from
         teammates is no longer kept apart."""
         pose = offset_pose(prior.pose, self._offset, POSE)
-        shared = ZERO3 if prior.shared is ZERO3 else self.covariance
         values = tuple([v + d for v, d in zip(self._common.values, self._changes, strict=True)])
-        common = self._common._replace(values=values, parameters=self._parameters)
-        covariance = self.covariance
-        if common.found:
-            covariance, parameters = self._sheared(common.found)
-            common = common._replace(parameters=parameters)
-            shared = ZERO3 if prior.shared is ZERO3 else covariance
+        covariance, parameters = self.covariance, self._parameters
+        if self._common.found:
+            covariance, parameters = self._sheared(self._common.found)
+        shared = ZERO3 if prior.shared is ZERO3 else covariance
+        common = self._common._replace(values=values, parameters=parameters)
         return Estimate(pose, covariance, shared), common
 
     def _sheared(self, found: tuple[int, ...]) -> tuple[Covariance3, Parameters]:
@@ -127,11 +137,8 @@ def updated(
     """After readings with independent noise. `with_camera`: whether the errors of the camera are
     estimated."""
     update = AugmentedUpdate(prior.covariance, common, estimated_of(common, with_camera))
-    for reading in readings:
-        update.add(reading)
-    if min(update.covariance.xx, update.covariance.yy, update.covariance.hh) < 0.0:
-        return prior, common
-    return update.result(prior)
+    update.after(readings)
+    return update.result(prior) if update.is_sound else (prior, common)
 
 
 def updated_by_teammate(
@@ -146,27 +153,22 @@ def updated_by_teammate(
     (`fusion.merge_split`), or naively. The common errors are only considered: a teammate may have
     its error from this camera, or from these places."""
     if not splits:
-        update = AugmentedUpdate(prior.covariance, common)
-        for reading in independent_readings(observation, observation.noise(), sensitivities):
-            update.add(reading)
-        least = min(update.covariance.xx, update.covariance.yy, update.covariance.hh)
-        return (prior, common) if least < 0.0 else update.result(prior)
+        readings = independent_readings(observation, observation.noise(), sensitivities)
+        update = AugmentedUpdate(prior.covariance, common).after(readings)
+        return update.result(prior) if update.is_sound else (prior, common)
 
     def attempt(weight: float) -> AugmentedUpdate:
         inflation = 1.0 if prior.shared is ZERO3 else 1.0 / weight
         update = AugmentedUpdate(prior.covariance, common, (), inflation, heading_only)
         noise = observation.noise(1.0 / (1.0 - weight))
-        for reading in independent_readings(observation, noise, sensitivities):
-            update.add(reading)
-        return update
+        return update.after(independent_readings(observation, noise, sensitivities))
 
     size: Callable[[Covariance3], float] = (
         (lambda c: c.hh) if heading_only else Covariance3.determinant
     )
     weight, extent = best_weight(lambda w: size(attempt(w).covariance))
     update = attempt(weight)
-    least = min(update.covariance.xx, update.covariance.yy, update.covariance.hh)
-    if extent >= size(prior.covariance) or least < 0.0:
+    if extent >= size(prior.covariance) or not update.is_sound:
         return prior, common
     estimate, common = update.result(prior)
     return estimate._replace(shared=estimate.covariance), common

@@ -23,7 +23,7 @@ from cpcbl_team.new_landmarks import LandmarkReading, relative_place, with_readi
 from cpcbl_team.parameters import Sensitivity, sensitivity_dot
 from cpcbl_team.places import EXACT, place_covariance
 from cpcbl_team.sensors import sighting_sigmas
-from cpcbl_team.state import State, with_common_errors, with_memory, with_uses
+from cpcbl_team.state import State, with_calibration, with_common_errors, with_uses
 
 _UNAFFECTED: tuple[Sensitivity, Sensitivity] = ((), ())
 
@@ -136,7 +136,7 @@ class CommonErrorFilter:
             used = with_uses(updates.objects_ns, {name: state.stamp_ns})
             state = state._replace(updates=updates._replace(objects_ns=used))
             memory = memory._replace(unplaced=unplaced, common=common)
-        return with_memory(state, state.memory._replace(calibration=memory))
+        return with_calibration(state, memory)
 
     def corrected(self, state: State, sighting: Sighting) -> Sighting:
         """The sighting without the errors of the camera that are known."""

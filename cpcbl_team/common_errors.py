@@ -19,7 +19,7 @@ from cpcbl_team.camera_errors import (
     range_sensitivity,
     without_errors,
 )
-from cpcbl_team.estimate import Estimate, Row
+from cpcbl_team.estimate import Estimate, Row, dot
 from cpcbl_team.gaussian import Covariance2, Gaussian2
 from cpcbl_team.inputs import Sighting
 from cpcbl_team.motion import motion_jacobian
@@ -28,7 +28,6 @@ from cpcbl_team.parameters import (
     Numbers,
     Parameters,
     Sensitivity,
-    dot,
     sensitivity_dot,
 )
 

@@ -93,6 +93,10 @@ ZERO3: Final = Covariance3(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 Row = tuple[float, float, float]
 
 
+def dot(a: Row, b: Row) -> float:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
 class Estimate(NamedTuple):
     """Pose (field_from_robot) and covariance; see the module's text for `shared`."""
 

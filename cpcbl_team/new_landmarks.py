@@ -9,9 +9,11 @@ import math
 from collections.abc import Iterator, Sequence
 from typing import Final, NamedTuple
 
+from cpcbl_team.constraints import NEAREST_M, circle, heading
+from cpcbl_team.estimate import circle_variance
 from cpcbl_team.fusion import chi_square_bound
 from cpcbl_team.gaussian import Covariance2, Gaussian2
-from cpcbl_team.geometry import Pose2, wrap_angle
+from cpcbl_team.geometry import Pose2
 from cpcbl_team.motion import drift_sigmas
 
 LEAST_READINGS: Final = 3  # one alone may have a wrong name
@@ -71,9 +73,7 @@ def relative_place(
     place, cost = found[0]
     x, y, covariance = place
     freedom = sum((r.range_m is not None) + (r.bearing_rad is not None) for r in readings) - 2
-    spread = 0.5 * (covariance.xx + covariance.yy) + math.hypot(
-        0.5 * (covariance.xx - covariance.yy), covariance.xy
-    )
+    spread = circle_variance(*covariance)
     nearest = min(math.hypot(x - s.pose.x, y - s.pose.y) for s in seen)
     if spread > (LARGEST_SHARE * nearest) ** 2 or freedom < 1 or cost > chi_square_bound(freedom):
         return None
@@ -94,15 +94,14 @@ class _Seen:
     def rows(self, x: float, y: float) -> Iterator[tuple[float, float, float, float]]:
         """(d/dx, d/dy, residual, variance) of what is expected of an object at (x, y)."""
         dx, dy = x - self.pose.x, y - self.pose.y
-        distance = max(math.hypot(dx, dy), 1e-3)
-        u, v, r = dx / distance, dy / distance, self.reading
-        if r.range_m is not None:
-            variance = r.range_sigma_m**2 + self.drift_m**2
-            yield u, v, r.range_m - distance, variance
+        distance, r = max(math.hypot(dx, dy), NEAREST_M), self.reading
+        if r.range_m is not None:  # a constraint is about the robot's place: the other way round
+            u, v, residual = circle(dx, dy, distance, r.range_m)
+            yield -u, -v, residual, r.range_sigma_m**2 + self.drift_m**2
         if r.bearing_rad is not None:
-            off = wrap_angle(r.bearing_rad + self.pose.heading - math.atan2(dy, dx))
+            u, v, residual = heading(dx, dy, distance**2, r.bearing_rad, self.pose.heading)
             variance = r.bearing_sigma_rad**2 + self.drift_rad**2 + (self.drift_m / distance) ** 2
-            yield -v / distance, u / distance, off, variance
+            yield u, v, -residual, variance
 
 
 def _starts(seen: Sequence[_Seen]) -> Iterator[tuple[float, float]]:
@@ -135,11 +134,10 @@ def _fit(x: float, y: float, seen: Sequence[_Seen]) -> tuple[Gaussian2, float] |
     if math.hypot(x, y) > FARTHEST_M:
         return None
     xx, xy, yy, _, _ = _normal_equations(x, y, seen)
-    determinant = xx * yy - xy * xy
-    if determinant <= 1e-12 * xx * yy:
+    information = Covariance2(xx, xy, yy)
+    if information.determinant() <= 1e-12 * xx * yy:
         return None
-    covariance = Covariance2(yy / determinant, -xy / determinant, xx / determinant)
-    return Gaussian2(x, y, covariance), cost
+    return Gaussian2(x, y, information.inverse()), cost
 
 
 def _normal_equations(

@@ -34,7 +34,7 @@ from cpcbl_team.motion import NO_VARIANCE, MotionVariance, distance_variance, tu
 from cpcbl_team.range_errors import NO_RANGE_ERRORS, RangeErrors, SeenLandmark
 from cpcbl_team.recovery_evidence import SPACING_NS
 from cpcbl_team.self_calibration import ReferencePose, ReferencePoses, self_calibrate
-from cpcbl_team.state import CalibrationMemory, Memory, RecoveryMemory, State, with_memory
+from cpcbl_team.state import CalibrationMemory, RecoveryMemory, State, with_calibration
 
 
 class OwnCalibration:
@@ -72,7 +72,7 @@ class OwnCalibration:
         distance *= memory.learned.distance_scale * memory.adaptation.distance_scale
         turn *= memory.learned.turn_scale * memory.adaptation.turn_scale
         memory = memory._replace(total_turn_rad=memory.total_turn_rad + turn)
-        return _with_calibration(state, memory), distance, turn
+        return with_calibration(state, memory), distance, turn
 
     def extra_variance(
         self, state: State, distance: float, turn: float, crawl_s: float
@@ -102,7 +102,7 @@ class OwnCalibration:
         if self._names_misplaced:
             rejections = rejections.plus(names, state.stamp_ns, state.updates.accepted)
         memory = memory._replace(check=check, rejections=rejections)
-        return _with_calibration(state, memory)
+        return with_calibration(state, memory)
 
     def after_update(self, state: State) -> State:
         """The state after an update of the pose, with what the robot learns from it."""
@@ -126,7 +126,7 @@ class OwnCalibration:
         """The state without what the robot noticed of its settings and of its map so far."""
         memory, check = state.memory.calibration, ModelCheck(accepted=state.updates.accepted)
         known = CalibrationMemory(memory.learned, memory.references, memory.total_turn_rad, check)
-        return _with_calibration(state, known._replace(common=memory.common))
+        return with_calibration(state, known._replace(common=memory.common))
 
     def _with_residuals(self, state: State) -> State:
         """The state that has compared what it read of landmarks with the map, once a block in which
@@ -154,7 +154,7 @@ class OwnCalibration:
             here_x, here_y, heading = here
             dx, dy = x - here_x, y - here_y
             sums.add(name, dx, dy, heading, range_m, bearing, k * sigma_m, k * sigma_rad)
-        return _with_calibration(state, memory._replace(residuals=sums.residuals()))
+        return with_calibration(state, memory._replace(residuals=sums.residuals()))
 
     def _with_ranges(self, state: State) -> State:
         """The state that has compared distances between landmarks with the map, once a block."""
@@ -171,7 +171,7 @@ class OwnCalibration:
                 # What was collected with other ranges is void
                 memory = memory._replace(check=ModelCheck(accepted=state.updates.accepted))
             memory = memory._replace(adaptation=present._replace(ranges=errors))
-        return _with_calibration(state, memory._replace(ranges=ranges))
+        return with_calibration(state, memory._replace(ranges=ranges))
 
     def _frames_since(
         self, recovery: RecoveryMemory, since_ns: int, present: RangeErrors
@@ -200,7 +200,7 @@ class OwnCalibration:
         else:
             known, references = self_calibrate(memory.learned, memory.references, here, self._noise)
             memory = memory._replace(learned=known, references=references)
-        return _with_calibration(state, memory)
+        return with_calibration(state, memory)
 
     def _after_check(self, state: State) -> State:
         """The state at the end of a block."""
@@ -248,9 +248,4 @@ class OwnCalibration:
         memory = state.memory.calibration
         learned, references, total_turn_rad, _, _, *others = memory
         parts = learned, references, total_turn_rad, check, present, *others
-        return _with_calibration(state, new(CalibrationMemory, parts))
-
-
-def _with_calibration(state: State, memory: CalibrationMemory) -> State:
-    recovery, teammates, _, events = state.memory
-    return with_memory(state, new(Memory, (recovery, teammates, memory, events)))
+        return with_calibration(state, new(CalibrationMemory, parts))

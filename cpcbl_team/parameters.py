@@ -123,10 +123,6 @@ class Parameters(NamedTuple):
         return Parameters(tuple(rows), self.with_pose + with_pose)
 
 
-def dot(row: Row, other: Row) -> float:
-    return row[0] * other[0] + row[1] * other[1] + row[2] * other[2]
-
-
 def sensitivity_dot(sensitivity: Sensitivity, numbers: Numbers) -> float:
     """The sum of a residual's derivatives times the numbers of the parameters."""
     total = 0.0

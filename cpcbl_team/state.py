@@ -317,12 +317,15 @@ def with_recovery(state: State, recovery: RecoveryMemory) -> State:
     return with_memory(state, new(Memory, (recovery, teammates, calibration, events)))
 
 
+def with_calibration(state: State, calibration: CalibrationMemory) -> State:
+    """The state with this memory of the calibration."""
+    recovery, teammates, _, events = state.memory
+    return with_memory(state, new(Memory, (recovery, teammates, calibration, events)))
+
+
 def with_common_errors(state: State, common: CommonErrors) -> State:
-    """The state that knows this of the constant errors of the camera."""
-    memory = state.memory
-    return with_memory(
-        state, memory._replace(calibration=memory.calibration._replace(common=common))
-    )
+    """The state that knows this of the errors that its sightings have in common."""
+    return with_calibration(state, state.memory.calibration._replace(common=common))
 
 
 def with_records(

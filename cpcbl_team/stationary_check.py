@@ -9,10 +9,9 @@ from cpcbl_team.geometry import new
 from cpcbl_team.measurements import GatedObject, combine
 from cpcbl_team.state import (
     CalibrationMemory,
-    Memory,
     State,
     TrustedPose,
-    with_memory,
+    with_calibration,
     with_recovery,
 )
 from cpcbl_team.stationary_pose import (
@@ -77,9 +76,8 @@ class StationaryCheck:
         if is_stationary(record, prior, place):
             return None
         is_old = stamp_ns - record.checkpoints[-1].stamp_ns >= TEST_NS
-        return (
-            self._with_new_record(state, prior) if is_old else state
-        )  # one that drives: once a second
+        # One that drives is asked once a second
+        return self._with_new_record(state, prior) if is_old else state
 
     def _observed(self, state: State, prior: Estimate, evidence: Sums) -> State:
         """The state after evidence of its own sensors about the offset from `prior`. Where all of
@@ -106,7 +104,5 @@ class StationaryCheck:
 
 
 def _with_record(state: State, record: StationaryRecord | None) -> State:
-    recovery, teammates, calibration, events = state.memory
-    *others, _ = calibration
-    memory = new(CalibrationMemory, (*others, record))
-    return with_memory(state, new(Memory, (recovery, teammates, memory, events)))
+    *others, _ = state.memory.calibration
+    return with_calibration(state, new(CalibrationMemory, (*others, record)))

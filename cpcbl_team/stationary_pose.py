@@ -11,7 +11,7 @@ the difference.
 import math
 from typing import Final, NamedTuple
 
-from cpcbl_team.estimate import ZERO3, Covariance3, Estimate, Row, Sums, merge
+from cpcbl_team.estimate import ZERO3, Covariance3, Estimate, Row, Sums, dot, merge
 from cpcbl_team.geometry import Pose2, new, wrap_angle
 from cpcbl_team.inflation import LEVER_M
 
@@ -114,7 +114,7 @@ def _push(checkpoints: tuple[Checkpoint, ...], total: Sums, pose: Pose2) -> Push
         then = checkpoint.estimate
         evidence = _since(checkpoint, total, _offset(reference, then.pose))
         offset, due = _mean(evidence, then.covariance)
-        chi_square = _dot(offset, due.inverse().times(offset))
+        chi_square = dot(offset, due.inverse().times(offset))
         if chi_square > most:
             most, found = chi_square, (checkpoint, evidence, offset)
     if found is None:
@@ -183,7 +183,3 @@ def _plus(total: Sums, evidence: Sums, at: Row) -> Sums:
 
 def _offset(origin: Pose2, pose: Pose2) -> Row:
     return pose.x - origin.x, pose.y - origin.y, wrap_angle(pose.heading - origin.heading)
-
-
-def _dot(a: Row, b: Row) -> float:
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]

@@ -27,6 +27,7 @@ from fuzz.mutations import (
     mutated_rows,
     mutated_tree,
     one_of,
+    write_mutated_json,
 )
 from fuzz.replays import (
     read_damaged_history,
@@ -133,12 +134,7 @@ def write_team(folder: Path, rng: random.Random) -> Path:
 def write_resolved(folder: Path, rng: random.Random) -> Path:
     """The team of a run, which its processes and recordings read as JSON."""
     data, path = _resolved(rng.choice(TEAMS)), folder / "team.json"
-    if rng.random() < 0.3:
-        path.write_bytes(mutated_bytes(data, rng))
-        return path
-    tree = json.loads(data)
-    mutated_tree(tree, rng)
-    path.write_text(json.dumps(tree))
+    write_mutated_json(path, data, rng, share=0.3)
     return path
 
 

@@ -1,10 +1,12 @@
 """Changes that hands, disks and enemies make to files: of bytes, and of what the bytes mean."""
 
+import json
 import random
 import struct
 import zlib
 from collections.abc import Callable
 from copy import deepcopy
+from pathlib import Path
 from typing import Any
 
 NUMBERS = (
@@ -39,6 +41,16 @@ def mutated_bytes(data: bytes, rng: random.Random) -> bytes:
             case _:
                 data = data[:at] if rng.random() < 0.3 else data + rng.randbytes(size)
     return data
+
+
+def write_mutated_json(path: Path, data: bytes, rng: random.Random, share: float) -> None:
+    """Writes a JSON file with changes: in this share of cases of its bytes, else of its values."""
+    if rng.random() < share:
+        path.write_bytes(mutated_bytes(data, rng))
+        return
+    tree = json.loads(data)
+    mutated_tree(tree, rng)
+    path.write_text(json.dumps(tree))
 
 
 def mutated_tree(tree: Any, rng: random.Random, values: tuple[Any, ...] = VALUES) -> None:

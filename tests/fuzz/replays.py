@@ -9,7 +9,7 @@ from functools import cache
 from pathlib import Path
 
 import msgspec
-from fuzz.mutations import mutated_bytes, mutated_tree
+from fuzz.mutations import mutated_bytes, mutated_tree, write_mutated_json
 from fuzz.runs import whole_run
 
 from cpcbl_agents.flight_recorder.entries import (
@@ -150,12 +150,7 @@ def write_history(folder: Path, rng: random.Random) -> Path:
         for strength in [STRENGTHS.get(kind, (0.0, 0.0))[1]]
     ]
     data = history_text(History(1, HISTORY_S, robots, tuple(rng.sample(events, 5))))
-    if rng.random() < 0.2:
-        path.write_bytes(mutated_bytes(data, rng))
-        return path
-    tree = json.loads(data)
-    mutated_tree(tree, rng)
-    path.write_text(json.dumps(tree))
+    write_mutated_json(path, data, rng, share=0.2)
     return path
 
 

@@ -197,9 +197,8 @@ class InputMonitor:
             self._initial_pose = snapshot.initial_pose
             self._note_initial_pose(now_ns)
         self.has_moved |= abs(odometry.distance_m) > MOVED_M or abs(odometry.turn_rad) > TURNED_RAD
-        self.has_moved |= (
-            snapshot.jump is not None
-        )  # it was carried away, or never was at its start
+        # One that was found elsewhere was carried away, or never was at its start
+        self.has_moved |= snapshot.jump is not None
         totals = self._totals(snapshot.refused, now_ns)
         if now_ns - self._start_ns >= SETTLED_NS:
             self._history.append(totals)

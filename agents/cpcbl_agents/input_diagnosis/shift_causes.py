@@ -12,7 +12,7 @@ import cmath
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import pairwise
-from statistics import median
+from statistics import fmean, median
 from typing import NamedTuple
 
 from cpcbl_agents.input_diagnosis.motion_causes import (
@@ -245,18 +245,11 @@ def _point(
 ) -> Point:
     """One of several sightings. `share`: how far off the landmark is seen, of its range."""
     number = len(some)
-    place = complex(_median([s[1].real for s in some]), _median([s[1].imag for s in some]))
-    variance = 0.5 * (_median([abs(s[0]) for s in some]) * share) ** 2 + LEAST_SIGMA_M**2
+    place = complex(median([s[1].real for s in some]), median([s[1].imag for s in some]))
+    variance = 0.5 * (median([abs(s[0]) for s in some]) * share) ** 2 + LEAST_SIGMA_M**2
     weight = (number * EFFICIENCY if number > 2 else number) / variance
     robot = sum([s[2] for s in some], 0j) / number
-    return Point(name, place, robot, math.fsum([s[3] for s in some]) / number, passed, weight)
-
-
-def _median(values: list[float]) -> float:
-    """That of `statistics`, which takes longer for the few values that there are."""
-    values.sort()
-    middle = len(values) // 2
-    return values[middle] if len(values) % 2 else (values[middle - 1] + values[middle]) / 2
+    return Point(name, place, robot, fmean([s[3] for s in some]), passed, weight)
 
 
 def _drift_rad(steps: Sequence[Step], wheels: OdometryNoise) -> float:

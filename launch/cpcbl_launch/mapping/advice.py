@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from cpcbl_launch.mapping.mapper import Mapped
-from cpcbl_launch.reporting.metrics import Floats
+from cpcbl_launch.reporting.metrics import Ellipse, Floats
 
 WEAK_M = 0.05  # of the major sigma, from which on a landmark is badly known
 WEAK_TIMES = 3.0  # or times the median of all, where that is more than
@@ -29,24 +29,19 @@ class _View(NamedTuple):
 
 def advice(mapped: Mapped) -> Iterator[str]:
     """One line for each landmark that is badly known, and one for the frame."""
-    majors = {n: _major(mapped.landmark(n)[1]) for n in mapped.names if n not in mapped.frame.known}
-    if not majors:
+    shapes = {n: mapped.ellipse(n) for n in mapped.names if n not in mapped.frame.known}
+    if not shapes:
         return
-    typical = float(np.median([sigma for sigma, _ in majors.values()]))
+    typical = float(np.median([shape.major_m for shape in shapes.values()]))
     limit = min(WEAK_M, max(WORTH_M, WEAK_TIMES * typical))
-    weak = {name: axis for name, axis in majors.items() if axis[0] > limit}
+    weak = {name: shape for name, shape in shapes.items() if shape.major_m > limit}
     turning = _turning_sigma(mapped)
-    by_frame = [n for n in weak if _turned_m(mapped, n, turning) > OF_FRAME * weak[n][0]]
+    by_frame = [n for n in weak if _turned_m(mapped, n, turning) > OF_FRAME * weak[n].major_m]
     if by_frame:
         yield _frame_advice(mapped, by_frame, weak, turning)
-    for name, axis in weak.items():
+    for name, shape in weak.items():
         if name not in by_frame:
-            yield _landmark_advice(mapped, name, axis)
-
-
-def _major(covariance: Floats) -> tuple[float, Floats]:
-    variances, axes = np.linalg.eigh(covariance)
-    return math.sqrt(max(float(variances[1]), 0.0)), axes[:, 1]
+            yield _landmark_advice(mapped, name, shape)
 
 
 def _centre(mapped: Mapped) -> Floats:
@@ -77,12 +72,12 @@ def _turned_m(mapped: Mapped, name: str, turning: float) -> float:
 
 
 def _frame_advice(
-    mapped: Mapped, names: list[str], weak: dict[str, tuple[float, Floats]], turning: float
+    mapped: Mapped, names: list[str], weak: dict[str, Ellipse], turning: float
 ) -> str:
-    far = max(names, key=lambda name: weak[name][0])
+    far = max(names, key=lambda name: weak[name].major_m)
     return (
         f"the direction of the map is known to {math.degrees(turning):.2f} deg, which makes"
-        f" {', '.join(names)} uncertain (up to {weak[far][0]:.2f} m): measure the place of one"
+        f" {', '.join(names)} uncertain (up to {weak[far].major_m:.2f} m): measure the place of one"
         f" that is far from the known landmarks, such as {far}, and name it with --known"
     )
 
@@ -98,8 +93,8 @@ def _view(mapped: Mapped, name: str) -> _View:
     return _View(int(mine.sum()), direction, abs(mean), float(np.median(np.hypot(dx, dy))))
 
 
-def _landmark_advice(mapped: Mapped, name: str, axis: tuple[float, Floats]) -> str:
-    sigma, major = axis
+def _landmark_advice(mapped: Mapped, name: str, shape: Ellipse) -> str:
+    sigma, _, turn = shape
     view, place = _view(mapped, name), mapped.landmark(name)[0]
     sight = np.array([math.cos(view.direction), math.sin(view.direction)])
     if view.length < ONE_SIDE:
@@ -108,7 +103,7 @@ def _landmark_advice(mapped: Mapped, name: str, axis: tuple[float, Floats]) -> s
             f"landmark {name} is known to {sigma:.2f} m: {why}; drive past it more often, within"
             f" {NEAR_M:g} m"
         )
-    along = abs(float(major @ sight)) > math.sqrt(0.5)
+    along = abs(math.cos(turn - view.direction)) > math.sqrt(0.5)
     how = "along" if along else "across"
     side = _side(mapped, place, sight)
     near = place + NEAR_M * side

@@ -14,7 +14,7 @@ from cpcbl_launch.mapping.noise import Noise, estimate_noise, with_noise
 from cpcbl_launch.mapping.problem import Problem
 from cpcbl_launch.mapping.sensor_check import sensor_fault
 from cpcbl_launch.mapping.solve import CONVERGED_M, Solution, covariances, solve
-from cpcbl_launch.reporting.metrics import Floats
+from cpcbl_launch.reporting.metrics import Ellipse, Floats, ellipse_of
 from cpcbl_team.config import Team
 from cpcbl_team.errors import InputError
 
@@ -48,6 +48,11 @@ class Mapped(NamedTuple):
         i = self.names.index(name)
         part = slice(2 * i, 2 * i + 2)
         return self.problem.parts(self.solution.x)[1][i], self.covariance[part, part]
+
+    def ellipse(self, name: str) -> Ellipse:
+        """That of one sigma of the place of a landmark (m, rad)."""
+        (xx, xy), (_, yy) = self.landmark(name)[1].tolist()
+        return ellipse_of(xx, xy, yy)
 
 
 def build_map(

@@ -9,7 +9,6 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
 from cpcbl_launch.mapping.mapper import Mapped
-from cpcbl_launch.mapping.report import ellipse
 
 FACTORS = (1, 2, 5, 10, 20, 50, 100)
 VISIBLE = 0.06  # of the size of the map: how large the largest ellipse is drawn at most
@@ -35,7 +34,7 @@ def draw_map(mapped: Mapped, path: Path) -> None:
 
 def _draw_landmarks(mapped: Mapped, axes: Axes, size: float) -> int:
     """Draws the ellipses, all larger by the same factor, which is returned."""
-    shapes = {name: ellipse(mapped.landmark(name)[1]) for name in mapped.names}
+    shapes = {name: mapped.ellipse(name) for name in mapped.names}
     largest = 3.0 * max(major for major, _, _ in shapes.values())
     factor = max((f for f in FACTORS if f * largest <= VISIBLE * size), default=1)
     for name, (major, minor, direction) in shapes.items():

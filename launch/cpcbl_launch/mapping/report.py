@@ -14,7 +14,6 @@ from cpcbl_launch.mapping.mapper import Mapped
 from cpcbl_launch.mapping.noise import BEARING as BEARING_NOISE
 from cpcbl_launch.mapping.noise import RANGE as RANGE_NOISE
 from cpcbl_launch.mapping.problem import BEARING, DISTANCE, RANGE, TURN
-from cpcbl_launch.reporting.metrics import Floats
 from cpcbl_launch.reporting.tables import STYLES, plural, table
 
 
@@ -81,16 +80,9 @@ def map_report(mapped: Mapped, runs: Sequence[str], seconds: float) -> MapReport
     )
 
 
-def ellipse(covariance: Floats) -> tuple[float, float, float]:
-    """Sigma along the major and the minor axis (m), and the direction of the first in [0, pi)."""
-    variances, axes = np.linalg.eigh(covariance)
-    minor, major = np.sqrt(np.maximum(variances, 0.0)).tolist()
-    return major, minor, math.atan2(*axes[::-1, 1].tolist()) % math.pi
-
-
 def _landmark(mapped: Mapped, name: str) -> LandmarkReport:
     place, covariance = mapped.landmark(name)
-    major, minor, direction = ellipse(covariance)
+    major, minor, direction = mapped.ellipse(name)
     mine = mapped.problem.readings.landmark == mapped.names.index(name)
     seers = {mapped.drives[i].robot for i in np.unique(mapped.problem.readings.drive[mine])}
     return LandmarkReport(
@@ -98,7 +90,7 @@ def _landmark(mapped: Mapped, name: str) -> LandmarkReport:
         y_m=float(place[1]),
         sigma_m=math.sqrt(0.5 * (major**2 + minor**2)),
         major_sigma_m=major,
-        major_direction_deg=math.degrees(direction),
+        major_direction_deg=math.degrees(direction % math.pi),
         covariance=(float(covariance[0, 0]), float(covariance[0, 1]), float(covariance[1, 1])),
         sightings=int(mine.sum()),
         robots=len(seers),

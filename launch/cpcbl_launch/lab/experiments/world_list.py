@@ -23,6 +23,7 @@ from cpcbl_team.config import (
 
 DURATION_S = 40.0
 LEARNING_S = 60.0  # for a robot whose settings are wrong
+AWAY = SimulationEvent(at_s=10.0, kidnap="r", to=(5.5, 4.0, 200.0))
 ZIGZAG = ((3.0, 2.5), (3.4, 3.5), (3.8, 2.5), (4.2, 3.5), (4.6, 2.5), (4.2, 3.6))
 KINDS = ("both", ""), ("range", " range-only"), ("bearing", " bearing-only")
 
@@ -105,13 +106,8 @@ def worlds() -> dict[str, World]:
         team = with_settings(_alone(_field(4, gives)), None, start=wide)
         found[f"wide prior{text}"] = World(team, ("r",))
     found |= _odometry_worlds() | _unknown_pose_worlds()
-    return (
-        found
-        | _team_worlds()
-        | _miscalibrated_worlds()
-        | _uncertain_map_worlds()
-        | _unsurveyed_worlds()
-    )
+    found |= _team_worlds() | _miscalibrated_worlds()
+    return found | _uncertain_map_worlds() | _unsurveyed_worlds()
 
 
 def _landmarks(count: int) -> str:
@@ -144,11 +140,10 @@ def _unknown_pose_worlds() -> dict[str, World]:
         for count in (1, 2, 3, 4):
             world = World(_alone(_field(count, gives), start=None), ("r",), drives_lost=True)
             found[f"start unknown, {_landmarks(count)}{text}"] = world
-    away = SimulationEvent(at_s=10.0, kidnap="r", to=(5.5, 4.0, 200.0))
     for gives, text in KINDS:
         length_s, from_s = (DURATION_S, 20.0) if gives == "both" else (60.0, 40.0)
         for count in (1, 2, 4):
-            team, name = _alone(_field(count, gives), away), _landmarks(count) + text
+            team, name = _alone(_field(count, gives), AWAY), _landmarks(count) + text
             world = World(team, ("r",), duration_s=length_s, scored_from_s=from_s)
             found[f"carried away, {name}"] = world._replace(drives_lost=gives != "both")
     return found
@@ -233,8 +228,7 @@ def _uncertain_map_worlds() -> dict[str, World]:
     found["uncertain map, 2 landmarks, standing"] = World(standing, ("r",))
     walls = Field(walls=all_robots().map.walls)
     found["uncertain walls"] = World(_with_uncertain_map(_alone(walls)), ("r",))
-    away = SimulationEvent(at_s=10.0, kidnap="r", to=(5.5, 4.0, 200.0))
-    carried = _with_uncertain_map(_alone(_field(4), away))
+    carried = _with_uncertain_map(_alone(_field(4), AWAY))
     found["uncertain map, carried away"] = World(carried, ("r",), scored_from_s=20.0)
     unknown = _with_uncertain_map(_alone(_field(4), start=None))
     found["uncertain map, start unknown"] = World(unknown, ("r",))

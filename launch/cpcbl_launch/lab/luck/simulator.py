@@ -119,10 +119,10 @@ class Simulation:
         network = self.network
         steppables: list[RobotProcess | GuestProcess]
         steppables = [*self.robots.values(), *self._guests.values()]
-        queued_ns = network.next_ns
-        due_ns = self._field_node.next_ns if queued_ns is None else queued_ns
-        due_ns = min([due_ns, self._field_node.next_ns, *[s.next_ns for s in steppables]])
-        network.run_until(min(end_ns, max(due_ns, network.now_ns)))
+        times_ns = [self._field_node.next_ns, *[s.next_ns for s in steppables]]
+        if (queued_ns := network.next_ns) is not None:
+            times_ns.append(queued_ns)
+        network.run_until(min(end_ns, max(min(times_ns), network.now_ns)))
         if self._field_node.next_ns <= network.now_ns:
             self._field_node.step(network.now_ns)
             for name, robot in self._field.robots.items():

@@ -13,8 +13,7 @@ from cpcbl_launch.views.traffic import LiveFlow, Traffic
 from cpcbl_launch.views.web.feed import LatestMessages, Snapshot, position_sigma_m
 from cpcbl_team.config import Field, Team
 from cpcbl_team.inputs import Sighting, SightingFault
-from cpcbl_transport import messages
-from cpcbl_transport.messages import Refusal, Truth
+from cpcbl_transport.messages import LandmarkEstimate, Refusal, Truth
 
 SEEN_S = 1.0  # sightings older than this are not drawn
 MOST_SEEN, LONGEST_TEXT = 50, 200
@@ -275,7 +274,7 @@ def robot_detail(name: str, latest: LatestMessages, traffic: Traffic) -> RobotDe
     )
 
 
-def _place(place: messages.LandmarkEstimate) -> LandmarkPicture:
+def _place(place: LandmarkEstimate) -> LandmarkPicture:
     x, y, _ = _triple(place.x_m, place.y_m, 0.0)
     return place.landmark, x, y, *_triple(*ellipse_of(*place.covariance))
 
