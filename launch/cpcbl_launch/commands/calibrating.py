@@ -37,8 +37,8 @@ class LogByDefault(TyperGroup):
 calibrate_app = Typer(
     cls=LogByDefault,
     no_args_is_help=True,
-    help="Errors of odometry, sensors and cameras, as tables of a team file. `calibrate [TEAM] LOG`"
-    " is short for `calibrate log [TEAM] LOG`.",
+    help="Errors of odometry, sensors and cameras, and places of landmarks, as tables of a team"
+    " file. `calibrate [TEAM] LOG` is short for `calibrate log [TEAM] LOG`.",
 )
 calibrate_app.command(LOG)(calibrate)
 
