@@ -6,7 +6,9 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
+import msgspec
 from support.buses import (
+    MAP,
     SECOND,
     robot_at,
     saw,
@@ -37,6 +39,7 @@ from cpcbl_launch.team.file import save_resolved
 from cpcbl_team.config import (
     Direction,
     Field,
+    Landmark,
     RobotSettings,
     SensorSettings,
     Start,
@@ -109,10 +112,13 @@ def test_both_ways_the_same_robots_do_send() -> None:
 
 
 def test_a_lost_robot_gets_fixes_from_all_and_sends_fixes_once_it_is_localized() -> None:
-    """`worst` is carried away from where it knew it was."""
+    """`worst` is carried away from where it knew it was. Three landmarks show that its bearings are
+    not mirrored: with two, a robot that stands does not help while its pose is not confirmed."""
     here = 3.0, 3.0
-    marks = [seen_between("oak", here, (4.0, 0.0)), seen_between("elm", here, (0.0, 4.0))]
+    landmarks = MAP.landmarks | {"ash": Landmark(x_m=6.0, y_m=5.0)}
+    marks = [seen_between(name, here, (m.x_m, m.y_m)) for name, m in landmarks.items()]
     team = team_with(best=GOOD, second=MIDDLING, worst=GOOD)
+    team = msgspec.structs.replace(team, map=Field(landmarks=landmarks))
     with wired(team) as robots:
         stand, (best, second, worst) = robots.stand, robots.links.values()
         agent = stand.robots["worst"].collaboration
