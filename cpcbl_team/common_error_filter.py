@@ -98,10 +98,13 @@ class CommonErrorFilter:
         return with_common_errors(state, common.without_objects())
 
     def has_no_place(self, state: State, name: str) -> bool:
-        """Whether nobody has surveyed this landmark, and the robot does not know its place yet."""
+        """Whether nobody has surveyed this landmark, and neither the robot nor a teammate that it
+        trusts knows its place yet."""
         common = state.common_errors
         assert common is not None
-        return name in self._field.unsurveyed and name not in common.objects
+        if name not in self._field.unsurveyed or name in common.objects:
+            return False
+        return name not in state.memory.teammates.trusted_landmarks
 
     def with_reading(self, state: State, sighting: Sighting, now_ns: int) -> State:
         """The state after a sighting of a landmark whose place is not known yet: with its place, if
@@ -165,7 +168,7 @@ class CommonErrorFilter:
         readings = [
             Reading(c.row, sensitivity, c.residual, c.sigma * c.sigma)
             for found in accepted
-            if not found.measurement.is_teammate
+            if not found.measurement.sender
             for c, sensitivity in zip(found.constraints, found.sensitivities, strict=True)
         ]
         estimate = prior
@@ -173,7 +176,7 @@ class CommonErrorFilter:
             estimate, common = updated(prior, common, readings, self._learns_camera)
         for found in accepted:
             m = found.measurement
-            if not m.is_teammate:
+            if not m.sender:
                 continue
             observation = observation_of(prior, m, found.constraints)
             moved = [b - a for a, b in zip(prior.pose, estimate.pose, strict=True)]

@@ -134,8 +134,20 @@ class Fix(msgspec.Struct, frozen=True, array_like=True, tag="fix"):
     heading_observer_variance: float = 0.0
 
 
+class LandmarkBelief(msgspec.Struct, frozen=True, array_like=True, tag="landmark"):
+    """Where a robot takes a landmark to be whose place is not on the map, in the field's frame.
+    `covariance` is xx, xy, yy (m^2)."""
+
+    robot: Name
+    landmark: Name
+    stamp_ns: int
+    x_m: float
+    y_m: float
+    covariance: tuple[float, float, float]
+
+
 class BeliefShared(msgspec.Struct, frozen=True, array_like=True, tag="told"):
-    """This robot's belief was sent: teammates' estimates may depend on its own from now on."""
+    """What this robot knows was sent: teammates' estimates may depend on its own from now on."""
 
     stamp_ns: int
 
@@ -150,4 +162,14 @@ class InputsMended(msgspec.Struct, frozen=True, array_like=True, tag="mended"):
     position_sigma_m: float = 0.0
 
 
-Input = Odometry | Sightings | Position | InitialPose | Belief | Fix | BeliefShared | InputsMended
+Input = (
+    Odometry
+    | Sightings
+    | Position
+    | InitialPose
+    | Belief
+    | Fix
+    | LandmarkBelief
+    | BeliefShared
+    | InputsMended
+)

@@ -116,7 +116,7 @@ class Localizer:
         gated = _NO_OBJECTS
         if others:
             gated = self.constrain(state.estimate, others, scope, state.common_errors)
-        if self.screen.has_recent_reports(state, now):  # beyond the paper: trust
+        if self.screen.is_due(state, gated):  # beyond the paper: trust
             state, gated = self.screen.screen_frame(state, landmarks, gated)
         prior = state.estimate
         if self._common is None:
@@ -198,7 +198,8 @@ class Localizer:
     ) -> tuple[State, list[Measurement], list[str]]:
         """The state that estimates the places of what is seen, the usable ones of these sightings,
         and the faults of those that have one."""
-        beliefs, pose = state.memory.teammates.beliefs, state.estimate.pose
+        mates, pose = state.memory.teammates, state.estimate.pose
+        told = mates.trusted_landmarks
         measured: list[Measurement] = []
         faults: list[str] = []
         calibration = state.memory.calibration
@@ -215,9 +216,8 @@ class Localizer:
                 if self._common.has_no_place(state, sighting.id):
                     state = self._common.with_reading(state, sighting, now_ns)
                     continue
-            m = measurement_of(
-                sighting, now_ns, pose, self.field, beliefs, self.settings, state.common_errors
-            )
+            known = mates.beliefs, self.settings, state.common_errors, told
+            m = measurement_of(sighting, now_ns, pose, self.field, *known)
             if m is not None:
                 m = m.corrected(bias, adaptation.ranges) if is_wrong else m
                 measured.append(m if factor == 1.0 else m.inflated(factor))

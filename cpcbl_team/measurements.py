@@ -3,7 +3,8 @@ and their evidence."""
 
 import math
 from collections.abc import Iterable, Mapping
-from typing import NamedTuple
+from types import MappingProxyType
+from typing import Final, NamedTuple
 
 import msgspec
 
@@ -33,12 +34,13 @@ from cpcbl_team.estimate import (
 from cpcbl_team.fusion import Observation, chi_square
 from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.geometry import Pose2, step, wrap_angle
-from cpcbl_team.inputs import Belief, HeadingBelief, Sighting
+from cpcbl_team.inputs import Belief, HeadingBelief, LandmarkBelief, Sighting
 from cpcbl_team.parameters import Sensitivity
 from cpcbl_team.places import EXACT, ObjectPosition, map_object
 from cpcbl_team.range_errors import RangeErrors
 from cpcbl_team.sensors import sighting_sigmas
 
+_NONE: Final[Mapping[str, LandmarkBelief]] = MappingProxyType({})
 BELIEF_VALID_BEFORE_NS = 500_000_000
 """A belief is also used for sightings of up to this time before it: a robot subscribes to a
 teammate's beliefs when it sees it, and what it saw before the first one came must not be lost."""
@@ -96,12 +98,15 @@ class Measurement(msgspec.Struct, frozen=True, gc=False):
     """Whether it may change the heading alone; it has no range then."""
     is_estimated: bool = False
     """Whether the robot estimates the object's place with its own pose."""
+    sender: str = ""
+    """The teammate whose word the position is; empty: the map's, or the robot's own."""
 
     @property
     def is_dependent(self) -> bool:
         """Whether its object's place has an error that the estimate may contain already, and that
         is not kept beside it."""
-        return self.is_teammate or (not self.is_estimated and any(self.position.covariance))
+        is_uncertain = not self.is_estimated and any(self.position.covariance)
+        return bool(self.sender) or is_uncertain
 
     @property
     def has_reading(self) -> bool:
@@ -155,12 +160,14 @@ def measurement_of(
     teammates: Mapping[str, tuple[Belief, ...]],
     settings: config.LocalizationSettings,
     common: CommonErrors | None = None,
+    told: Mapping[str, LandmarkBelief] = _NONE,
 ) -> Measurement | None:
-    """The sighting, from about `pose`, with its object's position; None if that is not known."""
+    """The sighting, from about `pose`, with its object's position; None if that is not known.
+    `told`: as of `map_object`."""
     name, is_for_heading, wall, gives = sighting.id, False, None, "both"
-    on_map = map_object(field, name, common)
+    on_map, sender = map_object(field, name, common, told), name
     if on_map is not None:
-        position, wall, gives = on_map
+        position, wall, gives, sender = on_map
     elif name in teammates and settings.collaboration.passive:
         nearest = nearest_belief(teammates[name], stamp_ns, settings.collaboration)
         if nearest is None:
@@ -178,8 +185,9 @@ def measurement_of(
         bearing = None
     sigmas = sighting_sigmas(sighting, sensor, _expected_range(pose, position, wall))
     read = range_m, bearing, *sigmas
-    is_estimated = common is not None and name in common.objects
-    return Measurement(name, position, wall, on_map is None, *read, is_for_heading, is_estimated)
+    is_estimated = common is not None and name in common.objects and not sender
+    about = on_map is None, *read, is_for_heading, is_estimated, sender
+    return Measurement(name, position, wall, *about)
 
 
 def _expected_range(pose: Pose2, position: ObjectPosition, wall: config.Wall | None) -> float:
@@ -295,8 +303,9 @@ def sensitivities_of(
     m: Measurement, cs: list[Constraint], common: CommonErrors
 ) -> tuple[Sensitivity, ...]:
     """How the residuals of constraints follow the common errors."""
+    estimated = m.source if m.is_estimated else ""
     return tuple(
-        common.sensitivity(m.source, c.place_row, c.is_bearing, c.row[2], m.range_m, m.bearing)
+        common.sensitivity(estimated, c.place_row, c.is_bearing, c.row[2], m.range_m, m.bearing)
         for c in cs
     )
 

@@ -94,7 +94,7 @@ class OwnCalibration:
     ) -> State:
         """The state that has noticed which objects of the map were rejected in a frame."""
         objects = [found.measurement for found in others]
-        names = [m.source for m in objects if not m.is_teammate] + landmarks.rejected
+        names = [m.source for m in objects if not m.sender] + landmarks.rejected
         memory = state.memory.calibration
         if not names or state.memory.recovery.lost or not self._is_checked:
             return state

@@ -1,16 +1,20 @@
 """Where the objects of the map are, as far as a robot knows, and how certain that is."""
 
 import math
+from collections.abc import Mapping
 from functools import lru_cache
-from typing import NamedTuple
+from types import MappingProxyType
+from typing import Final, NamedTuple
 
 from msgspec.structs import replace
 
 from cpcbl_team.common_errors import CommonErrors
 from cpcbl_team.config import Field, Gives, Landmark, Wall
 from cpcbl_team.gaussian import Covariance2
+from cpcbl_team.inputs import LandmarkBelief
 
 EXACT = Covariance2(0.0, 0.0, 0.0)
+_NONE: Final[Mapping[str, LandmarkBelief]] = MappingProxyType({})
 
 
 class ObjectPosition(NamedTuple):
@@ -28,18 +32,26 @@ class MapObject(NamedTuple):
     position: ObjectPosition  # of a wall: where it begins
     wall: Wall | None
     gives: Gives
+    sender: str = ""  # the teammate whose word its place is; empty: the map's, or the robot's own
 
 
-def map_object(field: Field, name: str, common: CommonErrors | None = None) -> MapObject | None:
+def map_object(
+    field: Field,
+    name: str,
+    common: CommonErrors | None = None,
+    told: Mapping[str, LandmarkBelief] = _NONE,
+) -> MapObject | None:
     """The object of this name; None if its place is not known. `common`: of a robot that estimates
-    the places of objects with its pose."""
+    the places of objects with its pose. `told`: the places of unsurveyed landmarks as teammates say
+    them; the more certain one counts."""
     is_estimated = common is not None and name in common.objects
     unsurveyed = field.unsurveyed.get(name)
     if unsurveyed is not None:
-        if common is None or not is_estimated:
-            return None
-        position = ObjectPosition(*common.place_error(name), common.place_covariance(name))
-        return MapObject(position, None, unsurveyed.gives)
+        own = None
+        if common is not None and is_estimated:
+            own = ObjectPosition(*common.place_error(name), common.place_covariance(name))
+        position, sender = _better(own, told.get(name))
+        return None if position is None else MapObject(position, None, unsurveyed.gives, sender)
     landmark = field.landmarks.get(name)
     if landmark is not None:
         x, y, covariance = _point(landmark)
@@ -55,6 +67,18 @@ def map_object(field: Field, name: str, common: CommonErrors | None = None) -> M
         wall = moved_wall(wall, *common.place_error(name))
         covariance = common.place_covariance(name)
     return MapObject(ObjectPosition(*wall.from_m, covariance), wall, wall.gives)
+
+
+def _better(
+    own: ObjectPosition | None, told: LandmarkBelief | None
+) -> tuple[ObjectPosition | None, str]:
+    """The more certain of a robot's own estimate and a teammate's word, and whose word that is."""
+    if told is None:
+        return own, ""
+    xx, _, yy = told.covariance
+    if own is not None and own.covariance.xx + own.covariance.yy <= xx + yy:
+        return own, ""
+    return ObjectPosition(told.x_m, told.y_m, Covariance2(*told.covariance)), told.robot
 
 
 def place_covariance(field: Field, name: str) -> Covariance2:

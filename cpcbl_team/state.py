@@ -15,7 +15,7 @@ from cpcbl_team.common_errors import CommonErrors
 from cpcbl_team.config import Field, Start
 from cpcbl_team.estimate import HEADING, POSE, POSITION, Covariance3, Estimate, Scope
 from cpcbl_team.geometry import Pose2, new, wrap_angle
-from cpcbl_team.inputs import Belief, Odometry, Sighting
+from cpcbl_team.inputs import Belief, LandmarkBelief, Odometry, Sighting
 from cpcbl_team.map_rejections import MapRejections
 from cpcbl_team.map_residuals import MapResiduals
 from cpcbl_team.miscalibration import (
@@ -152,6 +152,15 @@ class TeammateMemory(NamedTuple):
     beliefs: Mapping[str, tuple[Belief, ...]] = _NONE
     senders: Mapping[str, SenderRecord] = _NONE  # teammates, and the robot's own sensors
     last_report_ns: int = _NEVER_NS
+    landmarks: Mapping[str, LandmarkBelief] = _NONE  # the best word on each
+
+    @property
+    def trusted_landmarks(self) -> Mapping[str, LandmarkBelief]:
+        """The places of landmarks as teammates say them who are not in quarantine."""
+        if not self.landmarks:
+            return self.landmarks
+        in_quarantine = {name for name, record in self.senders.items() if record.reason}
+        return {n: told for n, told in self.landmarks.items() if told.robot not in in_quarantine}
 
 
 class CalibrationMemory(NamedTuple):
@@ -281,10 +290,10 @@ def with_memory(state: State, memory: Memory) -> State:
 
 def with_beliefs(state: State, beliefs_of: State) -> State:
     """The state with the beliefs of another one, and when the latest report of both came."""
-    _, senders, last_ns = state.memory.teammates
-    beliefs, _, other_ns = beliefs_of.memory.teammates
+    _, senders, last_ns, landmarks = state.memory.teammates
+    beliefs, _, other_ns, _ = beliefs_of.memory.teammates
     last_ns = other_ns if other_ns > last_ns else last_ns
-    return with_teammates(state, new(TeammateMemory, (beliefs, senders, last_ns)))
+    return with_teammates(state, new(TeammateMemory, (beliefs, senders, last_ns, landmarks)))
 
 
 def with_belief(state: State, belief: Belief, now_ns: int, oldest_ns: int) -> State:
@@ -299,6 +308,20 @@ def with_belief(state: State, belief: Belief, now_ns: int, oldest_ns: int) -> St
     return with_teammates(state, memory)
 
 
+def with_landmark(state: State, told: LandmarkBelief) -> State:
+    """The state with a teammate's word on a landmark, if that is newer than its own last one, or
+    better than another's."""
+    memory = state.memory.teammates
+    before = memory.landmarks.get(told.landmark)
+    if before is not None and before.robot != told.robot:
+        (xx, _, yy), (before_xx, _, before_yy) = told.covariance, before.covariance
+        is_trusted = before.landmark in memory.trusted_landmarks
+        if is_trusted and xx + yy >= before_xx + before_yy:
+            return state
+    landmarks = {**memory.landmarks, told.landmark: told}
+    return with_teammates(state, memory._replace(landmarks=landmarks))
+
+
 def with_teammates(state: State, teammates: TeammateMemory) -> State:
     """The state with this memory of teammates."""
     recovery, _, calibration, events = state.memory
@@ -307,8 +330,8 @@ def with_teammates(state: State, teammates: TeammateMemory) -> State:
 
 def with_senders(teammates: TeammateMemory, senders: Mapping[str, SenderRecord]) -> TeammateMemory:
     """The memory of teammates with these records of senders."""
-    beliefs, _, last_ns = teammates
-    return new(TeammateMemory, (beliefs, senders, last_ns))
+    beliefs, _, last_ns, landmarks = teammates
+    return new(TeammateMemory, (beliefs, senders, last_ns, landmarks))
 
 
 def with_recovery(state: State, recovery: RecoveryMemory) -> State:

@@ -62,20 +62,26 @@ class TeammateScreen:
         """Whether a teammate has reported anything lately that is to be screened."""
         return self.is_active and now_ns - state.memory.teammates.last_report_ns <= RECENT_NS
 
+    def is_due(self, state: State, gated: GatedObjects) -> bool:
+        """Whether what teammates say is to be screened in a frame: of late, or of its landmarks."""
+        if self.has_recent_reports(state, state.stamp_ns):
+            return True
+        return self.is_active and any(f.measurement.sender for objects in gated for f in objects)
+
     def screen_frame(
         self, state: State, landmarks: LandmarkUpdate, gated: GatedObjects
     ) -> tuple[State, GatedObjects]:
         """The state, and the gated objects without the teammates that the robot does not trust."""
         now, is_lost = state.stamp_ns, bool(state.memory.recovery.lost)
         accepted, rejected = (
-            sum(not found.measurement.is_teammate for found in objects) for objects in gated
+            sum(not found.measurement.sender for found in objects) for objects in gated
         )
         accepted, rejected = accepted + len(landmarks.used), rejected + len(landmarks.rejected)
         if (accepted or rejected) and not is_lost:
             sums = combine(Information.of(landmarks.evidence.sums()), gated.accepted)
             own = _own_offset(state, sums, gated.accepted)
             state = self._with_own_sensors(state, accepted, rejected, own)
-        distrusted = set()
+        state, distrusted = self._screen_landmarks(state, gated)
         for m, constraints, nis, observation, _ in (*gated.accepted, *gated.rejected):
             if m.is_teammate:
                 is_fresh = _has_fresh(state.memory.teammates.beliefs[m.source], now)
@@ -94,13 +100,45 @@ class TeammateScreen:
         accepted_ = [self._with_caution(state, found) for found in gated.accepted]
         return state, gated._replace(accepted=accepted_)
 
+    def _screen_landmarks(self, state: State, gated: GatedObjects) -> tuple[State, set[str]]:
+        """The state after the landmarks of a frame that stand where teammates say, and the senders
+        that are not trusted. All landmarks of a sender are one report of it, for they have the
+        error of this robot's own pose in common."""
+        by_sender: dict[str, list[GatedObject]] = {}
+        for found in (*gated.accepted, *gated.rejected):
+            m = found.measurement
+            if m.sender and not m.is_teammate:
+                by_sender.setdefault(m.sender, []).append(found)
+        distrusted = set()
+        for sender, objects in sorted(by_sender.items()):
+            freedom = sum(len(found.constraints) for found in objects)
+            of_two = 2.0 * sum(found.nis for found in objects) / freedom
+            evidence, first = None, objects[0]
+            if first.observation is not None:
+                of_it = self._evidence(state, first.observation)
+                evidence = _with_camera(state, first.measurement, of_it)
+            report = TeammateReport(
+                state.stamp_ns,
+                None if state.lost else of_two,
+                evidence=evidence,
+                is_guest=self._is_guest(sender),
+            )
+            state, is_trusted = self._assess(state, sender, report, first.measurement.source)
+            if not is_trusted:
+                distrusted.add(sender)
+        if by_sender:  # what they say is used now, whenever they said it
+            memory = state.memory.teammates
+            state = with_teammates(state, memory._replace(last_report_ns=state.stamp_ns))
+        return state, distrusted
+
     def _with_caution(self, state: State, found: GatedObject) -> GatedObject:
-        """A teammate as landmark with what this robot adds to the covariance of its position."""
+        """A teammate, or a landmark that stands where a teammate says, with what this robot adds to
+        the covariance of its position."""
         m = found.measurement
-        if not m.is_teammate:
+        if not m.sender:
             return found
         place = m.position._replace(
-            covariance=self._cautious(state, m.source, m.position.covariance)
+            covariance=self._cautious(state, m.sender, m.position.covariance)
         )
         m = replace(m, position=place)
         return found._replace(
@@ -241,7 +279,7 @@ def _own_offset(state: State, sums: Information, accepted: Iterable[GatedObject]
         return _evidence_at(state, sums)
     of_parameter: dict[int, Information] = {}
     for found in accepted:
-        if not found.measurement.is_teammate:
+        if not found.measurement.sender:
             for c, sensitivity in zip(found.constraints, found.sensitivities, strict=True):
                 for i, factor in sensitivity:
                     before = of_parameter.get(i, Information.none())
@@ -289,7 +327,7 @@ def _bounded(senders: SenderRecords) -> SenderRecords:
 
 
 def _without(objects: list[GatedObject], distrusted: set[str]) -> list[GatedObject]:
-    return [found for found in objects if found.measurement.source not in distrusted]
+    return [found for found in objects if found.measurement.sender not in distrusted]
 
 
 def _has_fresh(beliefs: Iterable[Belief], now_ns: int) -> bool:

@@ -85,9 +85,8 @@ class JointVariant:
                 if found.measurement.is_for_heading:
                     within, estimate = HEADING, with_all_shared(estimate)
                 observation = found.observation.shifted(dx, dy, turn)
-                estimate = self.observe(
-                    estimate, observation, within, found.measurement.is_teammate
-                )
+                by_teammate = bool(found.measurement.sender)
+                estimate = self.observe(estimate, observation, within, by_teammate)
         return self.reduce(estimate)
 
     def observe(
