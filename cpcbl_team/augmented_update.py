@@ -174,6 +174,35 @@ def updated_by_teammate(
     return estimate._replace(shared=estimate.covariance), common
 
 
+def updated_by_word(
+    prior: Estimate, common: CommonErrors, word: Observation, number: int, splits: bool
+) -> tuple[Estimate, CommonErrors] | None:
+    """After a teammate's word on a place, whose first parameter is this; None where it makes the
+    pose no better. By covariance intersection of all that is estimated: the word may have come from
+    what this robot once said. So a camera of uncertain errors would seem to know less of them after
+    each word; a robot with one takes no word."""
+    if any(common.camera_covariance):
+        return None
+    sensitivities: tuple[Sensitivity, ...] = (((number, 1.0),), ((number + 1, 1.0),))
+    estimated = estimated_of(common, False)
+
+    def attempt(weight: float, inflation: float) -> AugmentedUpdate:
+        wider = common._replace(parameters=common.parameters.inflated(inflation))
+        update = AugmentedUpdate(prior.covariance.scaled(inflation), wider, estimated)
+        noise = word.noise(1.0 / (1.0 - weight))
+        return update.after(independent_readings(word, noise, sensitivities))
+
+    if prior.shared is ZERO3 or not splits:  # nothing of it came from teammates, or went to them
+        update = attempt(0.0, 1.0)
+    else:
+        weight, _ = best_weight(lambda w: attempt(w, 1.0 / w).covariance.determinant())
+        update = attempt(weight, 1.0 / weight)
+    if update.covariance.determinant() >= prior.covariance.determinant() or not update.is_sound:
+        return None
+    estimate, common = update.result(prior)
+    return estimate._replace(shared=estimate.covariance if splits else estimate.shared), common
+
+
 def independent_readings(
     observation: Observation, noise: Covariance2, sensitivities: tuple[Sensitivity, ...]
 ) -> list[Reading]:

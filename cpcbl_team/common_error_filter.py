@@ -10,14 +10,15 @@ from cpcbl_team.augmented_update import (
     independent_readings,
     updated,
     updated_by_teammate,
+    updated_by_word,
 )
 from cpcbl_team.common_errors import CommonErrors
 from cpcbl_team.config import CameraSettings, Field, LocalizationSettings
-from cpcbl_team.estimate import Estimate
+from cpcbl_team.estimate import Estimate, Row
 from cpcbl_team.fusion import Observation
 from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.geometry import wrap_angle
-from cpcbl_team.inputs import Sighting
+from cpcbl_team.inputs import LandmarkBelief, Sighting
 from cpcbl_team.measurements import GatedObject, Measurement, observation_of
 from cpcbl_team.new_landmarks import LandmarkReading, relative_place, with_reading
 from cpcbl_team.parameters import Sensitivity, sensitivity_dot
@@ -25,6 +26,7 @@ from cpcbl_team.places import EXACT, place_covariance
 from cpcbl_team.sensors import sighting_sigmas
 from cpcbl_team.state import State, with_calibration, with_common_errors, with_uses
 
+ZERO_ROW: Row = (0.0, 0.0, 0.0)
 _UNAFFECTED: tuple[Sensitivity, Sensitivity] = ((), ())
 
 
@@ -98,13 +100,14 @@ class CommonErrorFilter:
         return with_common_errors(state, common.without_objects())
 
     def has_no_place(self, state: State, name: str) -> bool:
-        """Whether nobody has surveyed this landmark, and neither the robot nor a teammate that it
-        trusts knows its place yet."""
+        """Whether nobody has surveyed this landmark, and the robot does not know its place yet."""
+        return name in self._field.unsurveyed and not self.has_found(state, name)
+
+    def has_found(self, state: State, name: str) -> bool:
+        """Whether the robot estimates the place of this object with its pose."""
         common = state.common_errors
         assert common is not None
-        if name not in self._field.unsurveyed or name in common.objects:
-            return False
-        return name not in state.memory.teammates.trusted_landmarks
+        return name in common.objects
 
     def with_reading(self, state: State, sighting: Sighting, now_ns: int) -> State:
         """The state after a sighting of a landmark whose place is not known yet: with its place, if
@@ -195,6 +198,29 @@ class CommonErrorFilter:
                 m.is_for_heading,
             )
         return with_common_errors(state, common), estimate
+
+    def word_nis(self, state: State, told: LandmarkBelief, covariance: Covariance2) -> float:
+        """The normalized innovation squared of a teammate's word on a place that the robot has
+        found: chi-square of two degrees of freedom. `covariance`: of the word (m^2)."""
+        common = state.common_errors
+        assert common is not None
+        x, y = common.place_error(told.landmark)
+        total = common.place_covariance(told.landmark) + covariance
+        return total.mahalanobis_squared(told.x_m - x, told.y_m - y)
+
+    def with_word(self, state: State, told: LandmarkBelief, covariance: Covariance2) -> State:
+        """The state after a teammate's word on a place that the robot has found, by covariance
+        intersection of all that it estimates; unchanged where that makes the pose no better."""
+        common, prior = state.common_errors, state.estimate
+        assert common is not None
+        x, y = common.place_error(told.landmark)
+        number, residuals = common.objects[told.landmark], (told.x_m - x, told.y_m - y)
+        word = Observation((ZERO_ROW, ZERO_ROW), residuals, EXACT, covariance)
+        after = updated_by_word(prior, common, word, number, self._splits)
+        if after is None:
+            return state
+        estimate, common = after
+        return with_common_errors(state._replace(estimate=estimate), common)
 
     def observed(
         self, state: State, prior: Estimate, observation: Observation, by_teammate: bool

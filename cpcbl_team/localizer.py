@@ -26,6 +26,7 @@ from cpcbl_team.inputs import (
     Sighting,
     Sightings,
 )
+from cpcbl_team.landmark_words import LandmarkWords
 from cpcbl_team.landmarks import Landmarks, LandmarkUpdate
 from cpcbl_team.measurements import (
     BELIEF_VALID_BEFORE_NS,
@@ -96,12 +97,12 @@ class Localizer:
         self._common = common_error_filter(settings, field, camera)
         self._landmarks = Landmarks(field, settings, gates, self._common is not None)
         self._calibration = OwnCalibration(settings, field, self._landmarks)
-        parts = self._variant, self._calibration, self._common
-        self._prediction = Prediction(settings, *parts)
+        self._prediction = Prediction(settings, self._variant, self._calibration, self._common)
         has_common = self._common is not None or not field.is_exact
         self._stationary = StationaryCheck(settings, self._variant.reduce, has_common)
         self.recovery = Recovery(settings, field, self._landmarks, self._variant.reduce)
         self.screen = TeammateScreen(settings, gates, self._variant.is_probabilistic, team)
+        self.words = LandmarkWords(settings, field, self._common, self.screen)
 
     def cycle(self, state: State, frame: Sightings) -> State:
         """One cycle (paper, section 3, figure 1). Pure: the same inputs give the same bits.
@@ -199,7 +200,7 @@ class Localizer:
         """The state that estimates the places of what is seen, the usable ones of these sightings,
         and the faults of those that have one."""
         mates, pose = state.memory.teammates, state.estimate.pose
-        told = mates.trusted_landmarks
+        told = self.words.usable(state)
         measured: list[Measurement] = []
         faults: list[str] = []
         calibration = state.memory.calibration
@@ -213,7 +214,7 @@ class Localizer:
             if self._common is not None:
                 state = self._common.with_object(state, sighting.id)
                 sighting = self._common.corrected(state, sighting)
-                if self._common.has_no_place(state, sighting.id):
+                if sighting.id not in told and self._common.has_no_place(state, sighting.id):
                     state = self._common.with_reading(state, sighting, now_ns)
                     continue
             known = mates.beliefs, self.settings, state.common_errors, told

@@ -43,15 +43,18 @@ def map_object(
 ) -> MapObject | None:
     """The object of this name; None if its place is not known. `common`: of a robot that estimates
     the places of objects with its pose. `told`: the places of unsurveyed landmarks as teammates say
-    them; the more certain one counts."""
+    them, for those that it does not estimate."""
     is_estimated = common is not None and name in common.objects
     unsurveyed = field.unsurveyed.get(name)
     if unsurveyed is not None:
-        own = None
         if common is not None and is_estimated:
-            own = ObjectPosition(*common.place_error(name), common.place_covariance(name))
-        position, sender = _better(own, told.get(name))
-        return None if position is None else MapObject(position, None, unsurveyed.gives, sender)
+            position = ObjectPosition(*common.place_error(name), common.place_covariance(name))
+            return MapObject(position, None, unsurveyed.gives)
+        word = told.get(name)
+        if word is None:
+            return None
+        position = ObjectPosition(word.x_m, word.y_m, Covariance2(*word.covariance))
+        return MapObject(position, None, unsurveyed.gives, word.robot)
     landmark = field.landmarks.get(name)
     if landmark is not None:
         x, y, covariance = _point(landmark)
@@ -67,18 +70,6 @@ def map_object(
         wall = moved_wall(wall, *common.place_error(name))
         covariance = common.place_covariance(name)
     return MapObject(ObjectPosition(*wall.from_m, covariance), wall, wall.gives)
-
-
-def _better(
-    own: ObjectPosition | None, told: LandmarkBelief | None
-) -> tuple[ObjectPosition | None, str]:
-    """The more certain of a robot's own estimate and a teammate's word, and whose word that is."""
-    if told is None:
-        return own, ""
-    xx, _, yy = told.covariance
-    if own is not None and own.covariance.xx + own.covariance.yy <= xx + yy:
-        return own, ""
-    return ObjectPosition(told.x_m, told.y_m, Covariance2(*told.covariance)), told.robot
 
 
 def place_covariance(field: Field, name: str) -> Covariance2:

@@ -17,7 +17,7 @@ from cpcbl_team.fixes import PoseObservation
 from cpcbl_team.fusion import Observation
 from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.inflation import inflate_by_offset, inflate_to
-from cpcbl_team.inputs import Belief, Input, Position, Sightings
+from cpcbl_team.inputs import Belief, Input, LandmarkBelief, Position, Sightings
 from cpcbl_team.landmarks import LandmarkUpdate
 from cpcbl_team.mean_offsets import HEADING_VARIANCE, NOTHING, about_position
 from cpcbl_team.measurements import (
@@ -138,21 +138,29 @@ class TeammateScreen:
         if not m.sender:
             return found
         place = m.position._replace(
-            covariance=self._cautious(state, m.sender, m.position.covariance)
+            covariance=self.cautious(state, m.sender, m.position.covariance)
         )
         m = replace(m, position=place)
         return found._replace(
             measurement=m, observation=observation_of(state.estimate, m, found.constraints)
         )
 
+    def screen_word(self, state: State, told: LandmarkBelief, nis: float) -> tuple[State, bool]:
+        """The state after a teammate's word on a landmark of which the robot knows the place, and
+        whether it may be used. `nis`: of the two places, chi-square of two degrees of freedom."""
+        if not self.is_active:
+            return state, True
+        report = TeammateReport(state.stamp_ns, nis, is_guest=self._is_guest(told.robot))
+        return self._assess(state, told.robot, report, told.landmark)
+
     def with_caution(self, state: State, observation: PoseObservation) -> PoseObservation:
         """A teammate's fix with what this robot adds to the observer's part of its covariance."""
         if observation.observer is None:
             return observation
-        observer = self._cautious(state, observation.sender, observation.observer)
+        observer = self.cautious(state, observation.sender, observation.observer)
         return observation._replace(observer=observer)
 
-    def _cautious(self, state: State, sender: str, dependent: Covariance2) -> Covariance2:
+    def cautious(self, state: State, sender: str, dependent: Covariance2) -> Covariance2:
         """The part of a teammate's noise that is the same in all its reports: never below what this
         robot believes any teammate, and with the bias that others find in it. Split covariance
         intersection does not average this part away, so it bounds the weight of all its reports

@@ -27,7 +27,7 @@ from cpcbl_team.inputs import (
 )
 from cpcbl_team.localizer import Localizer
 from cpcbl_team.measurements import BELIEF_VALID_BEFORE_NS
-from cpcbl_team.state import State, with_beliefs, with_landmark
+from cpcbl_team.state import State, with_beliefs
 
 Key = tuple[int, int, str, bytes]
 HORIZON_NS = 2_000_000_000
@@ -38,7 +38,7 @@ _content = msgspec.msgpack.Encoder(enc_hook=float).encode
 _apply: dict[type, Callable[[Localizer, State, Input], State]] = {
     Belief: Localizer.add_teammate_belief,  # type: ignore[dict-item]
     HeadingBelief: Localizer.add_teammate_belief,  # type: ignore[dict-item]
-    LandmarkBelief: lambda localizer, state, told: with_landmark(state, told),  # type: ignore[arg-type]
+    LandmarkBelief: lambda localizer, state, told: localizer.words.add(state, told),  # type: ignore
     InitialPose: Localizer.set_pose,  # type: ignore[dict-item]
     Sightings: Localizer.cycle,  # type: ignore[dict-item]
     Position: Localizer.add_position,  # type: ignore[dict-item]

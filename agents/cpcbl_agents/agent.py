@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 from cpcbl_team.common_errors import CommonErrors
 from cpcbl_team.estimate import Estimate
-from cpcbl_team.inputs import Belief, BeliefShared, Fix, InputsMended, Sightings
-from cpcbl_transport.messages import Message
+from cpcbl_team.inputs import BeliefShared, InputsMended, LandmarkBelief, Sightings
+from cpcbl_transport.messages import Help, Message
 
 
 class Tick(NamedTuple):
@@ -37,6 +37,13 @@ class FrameEstimate(NamedTuple):
     common: CommonErrors | None = None  # what may be left of the camera's constant errors
 
 
+class LandmarkPlaces(NamedTuple):
+    """Where the filter takes the landmarks to be that are not on the team's map."""
+
+    stamp_ns: int
+    places: tuple[LandmarkBelief, ...]
+
+
 class Presence(NamedTuple):
     """The tier that a teammate's liveliness token announces; None when the teammate is gone."""
 
@@ -56,6 +63,12 @@ class BeliefSubscribers(NamedTuple):
     present: bool
 
 
+class LandmarkSubscribers(NamedTuple):
+    """Of which landmarks any teammate wants to know the place, as this robot knows it."""
+
+    landmarks: frozenset[str]
+
+
 class FrameSubscribers(NamedTuple):
     """Whether anybody subscribes to this robot's annotated frames at present."""
 
@@ -63,14 +76,23 @@ class FrameSubscribers(NamedTuple):
 
 
 class HelpSent(NamedTuple):
-    """A fix or belief was passed to the bus; `size` is its bytes on the link, 0 if it was not sent
-    because nobody subscribes."""
+    """Help was passed to the bus; `size` is its bytes on the link, 0 if it was not sent because
+    nobody subscribes."""
 
-    message: Belief | Fix
+    message: Help
     size: int
 
 
-BusEvent = Presence | UnknownRobot | BeliefSubscribers | FrameSubscribers | HelpSent
+BusEvent = (
+    Presence | UnknownRobot | BeliefSubscribers | LandmarkSubscribers | FrameSubscribers | HelpSent
+)
 AgentMessage = (
-    Message | Tick | PoseEstimate | FrameEstimate | BeliefShared | InputsMended | BusEvent
+    Message
+    | Tick
+    | PoseEstimate
+    | FrameEstimate
+    | LandmarkPlaces
+    | BeliefShared
+    | InputsMended
+    | BusEvent
 )

@@ -14,25 +14,25 @@ from msgspec.structs import astuple, replace
 
 from cpcbl_agents import agent
 from cpcbl_agents.guests import GuestRegistry
+from cpcbl_agents.landmark_sharing import LandmarkSharing
+from cpcbl_agents.message_counters import MessageCounters
 from cpcbl_team import information_gain as gains
 from cpcbl_team.config import LocalizationSettings
 from cpcbl_team.fixes import fix_for, with_sensor_factor, without_heading
 from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.information_gain import FixMemory, HeadingMemory
-from cpcbl_team.inputs import Belief, Fix, HeadingBelief
+from cpcbl_team.inputs import Belief, Fix, HeadingBelief, LandmarkBelief
 from cpcbl_team.tiers import LOWEST_TIER, accepted_tiers, next_tier
 from cpcbl_transport.budget import Budget
 from cpcbl_transport.compact import help_bytes, sent_bytes
-from cpcbl_transport.messages import Flow, Help, Track
+from cpcbl_transport.messages import Help, Track
 
 NEIGHBOUR_NS = 10_000_000_000  # a teammate's tier is watched for so long after it was seen
 IN_SIGHT_NS = 1_000_000_000  # its beliefs are useful for so long after it was seen
-MOST_PEERS = 256  # of which messages are counted one by one: guests of ever new names may come
-OTHERS = "others"  # in place of the peers that were heard or told anything longest ago
 EARLY_NS = 1_500_000_000  # a fix waits so long for its robot's tier
 
 
-def _size(message: Belief | Fix) -> int:
+def _size(message: Help) -> int:
     """The most bytes that the message takes on the link."""
     return sent_bytes(help_bytes(message))
 
@@ -56,50 +56,8 @@ class Interests(NamedTuple):
     """Teammates seen not long ago, and possible guests: the robot watches their tiers."""
     sources: frozenset[tuple[str, int]]
     """Teammates, with their tiers, whose beliefs are useful to this robot."""
-
-
-class MessageCounter:
-    """Messages of one topic from or for one teammate; the names are those of `Flow`."""
-
-    def __init__(self) -> None:
-        self.messages = self.bytes = self.over_budget = self.worthless = self.silent = 0
-        self.latest_ns = 0
-
-    def add(self, size: int, stamp_ns: int) -> None:
-        """One more message of so many bytes on the wire."""
-        self.messages += 1
-        self.bytes += size
-        self.latest_ns = max(self.latest_ns, stamp_ns)
-
-
-class MessageCounters:
-    """Counts of the fixes and beliefs that a robot sent, received and held back, by teammate."""
-
-    def __init__(self) -> None:
-        self._counters: dict[tuple[str, str], MessageCounter] = {}
-
-    def of(self, topic: str, peer: str) -> MessageCounter:
-        counter = self._counters.get((topic, peer))
-        if counter is None:
-            counter = self._counters[topic, peer] = MessageCounter()
-            if len(self._counters) > 2 * MOST_PEERS:
-                self._merge_oldest()
-        return counter
-
-    def _merge_oldest(self) -> None:
-        """Merges half of the counters of peers into one a topic."""
-        peers = [(topic, peer) for topic, peer in self._counters if peer not in ("", OTHERS)]
-        peers.sort(key=lambda key: self._counters[key].latest_ns)
-        for topic, peer in peers[:MOST_PEERS]:
-            gone = vars(self._counters.pop((topic, peer)))
-            sums = vars(self._counters.setdefault((topic, OTHERS), MessageCounter()))
-            latest_ns = max(sums["latest_ns"], gone["latest_ns"])
-            sums.update({name: sums[name] + gone[name] for name in sums}, latest_ns=latest_ns)
-
-    def flows(self) -> tuple[Flow, ...]:
-        """The counters as they are reported, without those that counted nothing."""
-        flows = (Flow(*key, **vars(counter)) for key, counter in sorted(self._counters.items()))
-        return tuple(f for f in flows if f.messages or f.over_budget or f.worthless or f.silent)
+    landmarks: frozenset[tuple[str, int]] = frozenset()
+    """Landmarks, with the tiers in which their places are useful to this robot."""
 
 
 class CollaborationAgent:
@@ -113,9 +71,11 @@ class CollaborationAgent:
         start_ns: int,
         budget: Budget,
         guests: GuestRegistry | None = None,
+        sharing: LandmarkSharing | None = None,
     ) -> None:
         self._robot, self._settings, self._teammates = robot, settings, teammates
         self.guests = guests or GuestRegistry()
+        self.landmarks = sharing or LandmarkSharing(robot, frozenset())
         self._rules, self.budget = settings.collaboration, budget
         if settings.localizer.variant == "weighted":  # without a covariance there is no gain
             self._rules = replace(self._rules, least_value=0.0, least_use=0.0, belief_share=0.0)
@@ -147,7 +107,10 @@ class CollaborationAgent:
     @property
     def interests(self) -> Interests | None:
         """What the robot announces and subscribes to; None before its first estimate."""
-        return Interests(self.tier, self.neighbours, self.sources) if self.latest else None
+        if self.latest is None:
+            return None
+        wanted = self.landmarks.wanted(self.latest.stamp_ns) if self._rules.passive else frozenset()
+        return Interests(self.tier, self.neighbours, self.sources, wanted)
 
     @property
     def has_started(self) -> bool:
@@ -159,7 +122,13 @@ class CollaborationAgent:
             case agent.PoseEstimate() if message.stamp_ns > self._track_ns:
                 return self._handle_estimate(message, now_ns)
             case agent.FrameEstimate():
+                self.landmarks.see(message.frame)
                 return self._fixes(message, now_ns)
+            case agent.LandmarkPlaces():
+                self.landmarks.update(message.places)
+                return self._landmark_words(now_ns)
+            case agent.LandmarkSubscribers(names):
+                self.landmarks.asked_for = names
             case agent.Presence(name, tier):
                 self.guests.set_presence(name, tier is not None)
                 self._tiers.pop(name, None)
@@ -351,6 +320,23 @@ class CollaborationAgent:
         self._last_belief = belief
         return [belief]
 
+    # Landmarks -----------------------------------------------------------------------------
+
+    def _landmark_words(self, now_ns: int) -> list[LandmarkBelief]:
+        """The place of a landmark that a teammate asks for, if the robot may tell it."""
+        is_lost = self.latest is None or bool(self.latest.lost)
+        may_tell = self.has_started and self._rules.passive and not (is_lost or self.may_mislead)
+        found = self.landmarks.next_word(now_ns) if may_tell else None
+        if found is None:
+            return []
+        told, last_ns = found
+        age_s = gains.UNKNOWN_AGE_S if last_ns == 0 else (now_ns - last_ns) * 1e-9
+        if not self._affords(now_ns, _size(told), age_s, urgent=False):
+            self.counters.of("landmark", "").over_budget += 1
+            return []
+        self.landmarks.note_sent(told)
+        return [told]
+
     # Budget, and what was really sent ----------------------------------------------------
 
     def _affords(self, now_ns: int, size: int, age_s: float, urgent: bool) -> bool:
@@ -378,6 +364,7 @@ class CollaborationAgent:
     def _record_sent(self, sent: agent.HelpSent, now_ns: int) -> None:
         message = sent.message
         topic, to = ("fix", message.robot) if isinstance(message, Fix) else ("belief", "")
+        topic = "landmark" if isinstance(message, LandmarkBelief) else topic
         if sent.size:
             self.counters.of(topic, to).add(sent.size, message.stamp_ns)
             if isinstance(message, Belief):
@@ -388,5 +375,5 @@ class CollaborationAgent:
         if isinstance(message, Fix):
             self._fix_memories.pop(message.robot, None)
             self._early_fixes.setdefault(message.robot, message)
-        else:
+        elif isinstance(message, Belief):
             self._last_belief = None

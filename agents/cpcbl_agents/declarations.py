@@ -36,6 +36,8 @@ class Declarations:
         self._token: Handle | None = None
         self._sources: frozenset[tuple[str, int]] = frozenset()
         self._neighbours: frozenset[str] = frozenset()
+        self._landmarks: frozenset[tuple[str, int]] = frozenset()
+        self._told: frozenset[tuple[str, int]] = frozenset()
         self.tier: int | None = None
         """The tier that is announced."""
         self.announced = 0
@@ -51,15 +53,15 @@ class Declarations:
         """Declares what is of interest now. Returns the teammates that are no longer watched."""
         if interests is None:
             return []
-        tier, neighbours, sources = interests
+        tier, neighbours, sources, landmarks = interests
         is_new_tier, old_token = tier != self.tier, self._token
         if is_new_tier:
             self.tier = tier
             key = topics.ALIVE.at(tier=tier, robot=self._robot, incarnation=self._incarnation)
             self._token = self._bus.declare_token(key)
             self.announced += 1
-        if is_new_tier or sources != self._sources:
-            self._sources = sources
+        if is_new_tier or sources != self._sources or landmarks != self._landmarks:
+            self._sources, self._landmarks = sources, landmarks
             subscribe = self._bus.subscribe
             keys = self._subscribed_keys(tier)
             _declare(self._subscriptions, keys, lambda k: subscribe(k, self._on_message))
@@ -82,12 +84,33 @@ class Declarations:
         for key in [k for k in self._publishers if k.startswith(own)]:
             self._publishers.pop(key).close()
 
+    def update_landmarks(self, tiers: Mapping[str, int]) -> frozenset[str]:
+        """The landmarks whose places somebody asks for in these tiers. Publishers of others are
+        taken back."""
+        told = frozenset(tiers.items())
+        for name, tier in self._told - told:
+            publisher = self._publishers.pop(self._landmark_key(name, tier), None)
+            if publisher is not None:
+                publisher.close()
+        self._told = told
+        topic = topics.LANDMARK
+        return frozenset(
+            name
+            for name, tier in sorted(told)
+            if self.publisher(topic, self._landmark_key(name, tier)).matching
+        )
+
+    def _landmark_key(self, name: str, tier: int) -> str:
+        return topics.LANDMARK.at(landmark=name, tier=tier, robot=self._robot)
+
     def _subscribed_keys(self, tier: int) -> Iterable[str]:
         if self._rules.active:
             for better in accepted_tiers(tier, self._rules):
                 yield topics.FIX.at(robot=self._robot, tier=better)
         for name, their_tier in self._sources:
             yield topics.BELIEF.at(tier=their_tier, robot=name)
+        for name, its_tier in self._landmarks:
+            yield topics.LANDMARK.at(landmark=name, tier=its_tier)
 
 
 def _declare(

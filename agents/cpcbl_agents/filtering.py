@@ -4,7 +4,14 @@ import math
 from collections import Counter, deque
 from collections.abc import Sequence
 
-from cpcbl_agents.agent import AgentMessage, FrameEstimate, PoseEstimate, Presence, Tick
+from cpcbl_agents.agent import (
+    AgentMessage,
+    FrameEstimate,
+    LandmarkPlaces,
+    PoseEstimate,
+    Presence,
+    Tick,
+)
 from cpcbl_team.config import CameraSettings, Field, LocalizationSettings
 from cpcbl_team.inputs import (
     Belief,
@@ -13,6 +20,7 @@ from cpcbl_team.inputs import (
     InitialPose,
     Input,
     InputsMended,
+    LandmarkBelief,
     Odometry,
     Position,
     Sightings,
@@ -42,8 +50,11 @@ class FilterAgent:
         teammates: frozenset[str],
         start_ns: int,
         camera: CameraSettings | None = None,
+        robot: str = "",
+        shared: frozenset[str] = frozenset(),
     ) -> None:
-        """`camera`: of a robot whose sightings are its camera's."""
+        """`camera`: of a robot whose sightings are its camera's. `shared`: the landmarks whose
+        places `robot` may tell its teammates, and they it."""
         localizer = Localizer(settings, field, teammates, camera)
         self.timeline = Timeline(localizer, localizer.start(start_ns))
         self.counts: Counter[str] = Counter()
@@ -51,7 +62,7 @@ class FilterAgent:
         """The same of inputs: by the name of the input, and the reason."""
         self.initial_pose: InitialPose | None = None
         """The newest that somebody has set."""
-        self._field = field
+        self._field, self._robot, self._shared = field, robot, sorted(shared)
         has_own = settings.position_sensor is not None  # which may lead it anywhere
         self._farthest_m = math.inf if has_own else 2.0 * settings.sensor.max_range_m
         self._known = field.names | teammates
@@ -87,11 +98,13 @@ class FilterAgent:
 
     @property
     def places(self) -> tuple[LandmarkEstimate, ...]:
-        """The landmarks whose places the robot estimates beside its pose."""
-        common = self.timeline.state.common_errors
-        if common is None:
-            return ()
-        found = ((name, map_object(self._field, name, common)) for name in common.objects)
+        """The landmarks whose places the robot estimates beside its pose, or knows from
+        teammates."""
+        state = self.timeline.state
+        common, told = state.common_errors, state.memory.teammates.trusted_landmarks
+        names = [] if common is None else [*common.objects]
+        names += [name for name in told if name not in names]
+        found = ((name, map_object(self._field, name, common, told)) for name in names)
         return tuple(
             LandmarkEstimate(name, p.position.x, p.position.y, p.position.covariance)
             for name, p in found
@@ -118,6 +131,11 @@ class FilterAgent:
                 return self._frame_estimates(now_ns)
             case Position() | Belief() | Fix() | BeliefShared() | InputsMended():
                 self._add(message)
+            case LandmarkBelief(landmark=name):
+                if name in self._field.unsurveyed:
+                    self._add(message)
+                else:
+                    self.counts["unknown_object"] += 1
             case InitialPose():
                 self._set_pose(message)
             case Presence(name, None):
@@ -125,7 +143,8 @@ class FilterAgent:
             case Presence(name) if name not in self._known:
                 self._guests.add(name)
             case Tick() if now_ns >= self.next_ns:
-                return [*self._frame_estimates(now_ns), self._regular_estimate(now_ns)]
+                frames, regular = self._frame_estimates(now_ns), self._regular_estimate(now_ns)
+                return [*frames, regular, *self._landmark_places(now_ns)]
         return ()
 
     def _add(self, item: Input) -> bool:
@@ -158,6 +177,20 @@ class FilterAgent:
             seconds = (o.stamp_ns - o.from_ns) * 1e-9
             speed, turn_rate = o.distance_m / seconds, o.turn_rad / seconds
         return PoseEstimate(state.stamp_ns, state.reported, state.lost, speed, turn_rate)
+
+    def _landmark_places(self, now_ns: int) -> list[LandmarkPlaces]:
+        """Where the shared landmarks are; nothing where there are none."""
+        if not self._shared:
+            return []
+        state = self.timeline.state
+        common, told = state.common_errors, state.memory.teammates.trusted_landmarks
+        places = []
+        for name in self._shared:
+            found = map_object(self._field, name, common, told)
+            if found is not None:
+                who, (x, y, (xx, xy, yy)) = found.sender or self._robot, found.position
+                places.append(LandmarkBelief(who, name, now_ns, x, y, (xx, xy, yy)))
+        return [LandmarkPlaces(now_ns, tuple(places))]
 
     def _frame_estimates(self, now_ns: int) -> list[FrameEstimate]:
         """The estimate at each frame that odometry covers by now, or that waited long enough."""

@@ -8,17 +8,18 @@ from typing import NamedTuple, Protocol
 import msgspec
 
 from cpcbl_agents import agent
-from cpcbl_agents.agent import BeliefSubscribers, FrameSubscribers
+from cpcbl_agents.agent import BeliefSubscribers, FrameSubscribers, LandmarkSubscribers
 from cpcbl_agents.clocks import ClockMonitor
-from cpcbl_agents.collaboration import MessageCounters
 from cpcbl_agents.declarations import Declarations, LivelinessTokens
 from cpcbl_agents.input_diagnosis.monitor import InputMonitor
+from cpcbl_agents.landmark_sharing import landmark_tier
 from cpcbl_agents.load import LoadMonitor, MayGoOn, everything
+from cpcbl_agents.message_counters import MessageCounters
 from cpcbl_agents.pose_output import PoseOutput
 from cpcbl_agents.robot import Robot
 from cpcbl_agents.tape import NO_TAPE, Tape
 from cpcbl_team.config import Team
-from cpcbl_team.inputs import Belief, Fix
+from cpcbl_team.inputs import Belief, Fix, LandmarkBelief
 from cpcbl_transport import messages, topics
 from cpcbl_transport.bus import Bus
 from cpcbl_transport.compact import encode_help, received_bytes, sent_bytes
@@ -164,6 +165,7 @@ class Node:
             self._handle_payload(*frame, now_ns)
         if self._passive and self._declarations.tier is not None:
             self._check_subscribers(topics.BELIEF, BeliefSubscribers, now_ns)
+            self._check_landmark_subscribers(now_ns)
         if self.robot.sensing.has_detector:
             self._check_subscribers(topics.LOOK, FrameSubscribers, now_ns)
         outgoing = self.robot.handle(agent.Tick(), now_ns)
@@ -207,6 +209,9 @@ class Node:
             case Fix(observer=name):  # by a subscription to all observers
                 size = received_bytes(len(payload), name)
                 self.received.of("fix", name).add(size, message.stamp_ns)
+            case LandmarkBelief(robot=name):  # the same
+                size = received_bytes(len(payload), name)
+                self.received.of("landmark", name).add(size, message.stamp_ns)
             case Belief(robot=name):  # by one to this key
                 size = sent_bytes(len(payload))
                 self.received.of("belief", name).add(size, message.stamp_ns)
@@ -226,7 +231,7 @@ class Node:
         match message:
             case Refusal():
                 return message
-            case Belief(robot=sender) | Fix(observer=sender):
+            case Belief(robot=sender) | LandmarkBelief(robot=sender) | Fix(observer=sender):
                 if sender not in self._team and not self.robot.is_guest(sender):
                     self.robot.handle(agent.UnknownRobot(sender), now_ns)
                     return Refusal.UNKNOWN_ROBOT
@@ -259,6 +264,13 @@ class Node:
             self._subscribed[event] = subscribed
             self.robot.handle(event(bool(subscribed)), now_ns)
 
+    def _check_landmark_subscribers(self, now_ns: int) -> None:
+        """Tells the robot of which landmarks teammates want to know the places."""
+        sharing = self.robot.collaboration.landmarks
+        asked_for = self._declarations.update_landmarks(sharing.tiers)
+        if asked_for != sharing.asked_for:
+            self.robot.handle(LandmarkSubscribers(asked_for), now_ns)
+
     def _send(self, outgoing: Iterable[Outgoing], now_ns: int) -> None:
         for message in outgoing:
             size = self._publish(message)
@@ -267,8 +279,10 @@ class Node:
 
     def _publish(self, message: Outgoing | Status) -> int:
         """Publishes if there is a subscriber; returns the bytes of the payload, 0 without one."""
-        topic, tier = topic_of(type(message)), self._declarations.tier
-        key = topic.at(tier=tier, robot=message.robot, observer=self._name)
+        topic, tier, landmark = topic_of(type(message)), self._declarations.tier, ""
+        if isinstance(message, LandmarkBelief):
+            landmark, tier = message.landmark, landmark_tier(message)
+        key = topic.at(tier=tier, robot=message.robot, observer=self._name, landmark=landmark)
         publisher = self._declarations.publisher(topic, key)
         if not publisher.matching:
             return 0

@@ -16,6 +16,7 @@ from cpcbl_agents.clocks import ClockMonitor
 from cpcbl_agents.collaboration import CollaborationAgent
 from cpcbl_agents.filtering import FilterAgent
 from cpcbl_agents.guests import GuestRegistry
+from cpcbl_agents.landmark_sharing import LandmarkSharing
 from cpcbl_agents.sensing import SensingAgent
 from cpcbl_agents.sources import OwnCamera, Source
 from cpcbl_agents.waypoint_follower import WaypointFollower
@@ -67,14 +68,17 @@ class Robot:
         self.name, self.sensing, self._shared_ns = name, sensing, start_ns
         self.start = RobotStart(start_ns, team.robots[name].start is not None, restarted)
         camera = settings.camera if settings.sensing == "camera" else None
-        self.filter = FilterAgent(settings, team.map, teammates, start_ns, camera)
+        shared = frozenset(team.map.unsurveyed)
+        known = settings, team.map_of(name), teammates, start_ns
+        self.filter = FilterAgent(*known, camera, name, shared)
         self._is_weighted = settings.localizer.variant == "weighted"  # it has no covariance
         self._sightings_input = "frame" if settings.sensing == "camera" else "sightings"
         match = team.messages_per_s(name), restarted, team.match.duration_s
         budget = Budget(settings.collaboration.budget, start_ns, *match)
-        known = team.map.names | frozenset(team.robots)
-        guests = GuestRegistry(known, team.guests.most if team.guests.allowed else 0)
-        self.collaboration = CollaborationAgent(name, settings, teammates, start_ns, budget, guests)
+        names = team.map.names | frozenset(team.robots)
+        guests = GuestRegistry(names, team.guests.most if team.guests.allowed else 0)
+        agent = name, settings, teammates, start_ns, budget, guests
+        self.collaboration = CollaborationAgent(*agent, LandmarkSharing(name, shared))
 
     def handle(self, message: Message | Tick | BusEvent, now_ns: int) -> list[Outgoing]:
         """Everything that this robot publishes because of one message (from the bus, or a tick).

@@ -22,6 +22,7 @@ from cpcbl_team.config.field import Bands as Bands
 from cpcbl_team.config.field import Field as Field
 from cpcbl_team.config.field import Gives as Gives
 from cpcbl_team.config.field import Landmark as Landmark
+from cpcbl_team.config.field import LandmarkPosition as LandmarkPosition
 from cpcbl_team.config.field import Light as Light
 from cpcbl_team.config.field import SimulationEvent as SimulationEvent
 from cpcbl_team.config.field import SimulationSettings as SimulationSettings

@@ -12,15 +12,11 @@ Bands = tuple[str, str]
 """The names of two colours, the upper one first."""
 
 
-class Landmark(Table, frozen=True, kw_only=True):
-    """A point whose position in the field's frame is known beforehand."""
+class LandmarkPosition(Table, frozen=True, kw_only=True):
+    """Where a landmark stands, in the field's frame."""
 
     x_m: float
     y_m: float
-    gives: Gives = "both"
-    """Which measurements of it the robots use."""
-    colours: Bands | None = None
-    """The colour bands of the cylinder that stands there, by which a camera recognises it."""
     sigma_m: NotNegative = 0.0
     """Standard deviation of its place along each axis of the field (m); 0: it is known exactly."""
     covariance_m2: tuple[float, float, float] | None = None
@@ -29,6 +25,15 @@ class Landmark(Table, frozen=True, kw_only=True):
     @property
     def is_exact(self) -> bool:
         return self.sigma_m == 0.0 and not any(self.covariance_m2 or ())
+
+
+class Landmark(LandmarkPosition, frozen=True, kw_only=True):
+    """A point whose position in the field's frame is known beforehand."""
+
+    gives: Gives = "both"
+    """Which measurements of it the robots use."""
+    colours: Bands | None = None
+    """The colour bands of the cylinder that stands there, by which a camera recognises it."""
 
 
 class Unsurveyed(Table, frozen=True, kw_only=True):

@@ -6,7 +6,13 @@ import msgspec
 
 from cpcbl_team.config.camera import CameraSettings, Side, VisionSettings
 from cpcbl_team.config.collaboration import CollaborationSettings
-from cpcbl_team.config.field import Bands, Field, SimulationSettings
+from cpcbl_team.config.field import (
+    Bands,
+    Field,
+    Landmark,
+    LandmarkPosition,
+    SimulationSettings,
+)
 from cpcbl_team.config.localizer import LocalizerSettings
 from cpcbl_team.config.recording import RecordingSettings
 from cpcbl_team.config.ros2 import Ros2RobotSettings, Ros2Settings
@@ -27,6 +33,7 @@ class GuardSettings(Table, frozen=True, kw_only=True):
     """Of fixes for one teammate. The router drops a fix that follows the last one sooner than
     1 / rate, and messages come unevenly, so this must be at least twice the sensor's rate."""
     belief_rate_hz: Positive = 50.0
+    """Of the beliefs of one robot, and of the places of landmarks that it tells."""
     largest_help_bytes: Annotated[int, msgspec.Meta(ge=1)] = 256
     """The largest payload of a fix or belief."""
     largest_bytes: Annotated[int, msgspec.Meta(ge=1)] = 65_536
@@ -125,6 +132,8 @@ class RobotSettings(LocalizationSettings, frozen=True, kw_only=True):
     speed_m_s: NotNegative = 0.5
     pose_rate_hz: Annotated[float, msgspec.Meta(gt=0.0, le=100.0)] = 10.0
     """How often the robot publishes its pose (`pose/<robot>`) while somebody subscribes to it."""
+    known_landmarks: dict[str, LandmarkPosition] = msgspec.field(default_factory=dict)
+    """Where landmarks of `map.unsurveyed` stand, as this robot alone knows from the start."""
     ros2: Ros2RobotSettings = Ros2RobotSettings()
     """Its topics and frames in ROS 2, for a team with the table `ros2`."""
 
@@ -189,6 +198,19 @@ class Team(Table, frozen=True, kw_only=True):
     def renders(self) -> bool:
         """Whether the simulated field must render images."""
         return any(self.robots[name].source == "simulated" for name in self.cameras)
+
+    def map_of(self, robot: str) -> Field:
+        """The map as this robot knows it from the start."""
+        known = self.robots[robot].known_landmarks
+        if not known:
+            return self.map
+        unsurveyed = dict(self.map.unsurveyed)
+        landmarks = dict(self.map.landmarks)
+        for name, place in known.items():
+            mark = unsurveyed.pop(name)
+            position = msgspec.structs.asdict(place)
+            landmarks[name] = Landmark(gives=mark.gives, colours=mark.colours, **position)
+        return msgspec.structs.replace(self.map, landmarks=landmarks, unsurveyed=unsurveyed)
 
     def messages_per_s(self, robot: str) -> float | None:
         """The rate at which a robot earns its share of the match's messages; None: no limit."""

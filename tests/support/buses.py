@@ -22,12 +22,12 @@ from cpcbl_team.config import (
     Start,
     Team,
 )
-from cpcbl_team.inputs import Belief, Fix, Odometry, Sighting, Sightings
+from cpcbl_team.inputs import Odometry, Sighting, Sightings
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus, Handle
 from cpcbl_transport.compact import decode_help, encode_help
 from cpcbl_transport.memory_bus import MemoryHub
-from cpcbl_transport.messages import Message, Refusal, Status, decode_tagged, encode
+from cpcbl_transport.messages import Help, Message, Refusal, Status, decode_tagged, encode
 
 MS = 1_000_000
 SECOND = 1000 * MS
@@ -62,7 +62,7 @@ def wait_until(condition: Callable[[], bool]) -> None:
 
 def written(message: Message) -> bytes:
     """The payload of any message."""
-    return encode_help(message) if isinstance(message, Belief | Fix) else encode(message)
+    return encode_help(message) if isinstance(message, Help) else encode(message)
 
 
 class Subscription:

@@ -4,7 +4,8 @@ from collections.abc import Sequence
 from typing import Any, TypeVar
 
 from cpcbl_agents.agent import BeliefSubscribers, FrameEstimate, HelpSent, PoseEstimate, Presence
-from cpcbl_agents.collaboration import CollaborationAgent, MessageCounter
+from cpcbl_agents.collaboration import CollaborationAgent
+from cpcbl_agents.message_counters import MessageCounter
 from cpcbl_team.config import (
     BudgetSettings,
     CollaborationSettings,

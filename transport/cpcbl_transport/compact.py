@@ -1,4 +1,5 @@
-"""The wire format of beliefs (40 bytes) and fixes (32 bytes, 39 with a heading).
+"""The wire format of help: beliefs (40 bytes), fixes (32 bytes, 39 with a heading) and the places
+of landmarks (25 bytes).
 
 The payload is one version byte, then whole numbers of fixed width, little-endian, each a count of
 its unit. Names travel in the key; the length tells whether a fix has a heading. Poses are rounded
@@ -17,9 +18,9 @@ from collections.abc import Sequence
 from functools import lru_cache
 from typing import NamedTuple
 
-from cpcbl_team.inputs import NAME_PATTERN, Belief, Fix
+from cpcbl_team.inputs import NAME_PATTERN, Belief, Fix, LandmarkBelief
 from cpcbl_transport import topics
-from cpcbl_transport.messages import VERSION, Refusal, header_refusal
+from cpcbl_transport.messages import VERSION, Help, Refusal, header_refusal
 
 STAMP_NS = 1_000
 PLACES = 100_000  # a metre
@@ -66,23 +67,29 @@ _FIX = (_STAMP, _PLACE, _PLACE, *_COVARIANCE_2, *_COVARIANCE_2)
 _HEADED_FIX = (*_FIX, _HEADING, _SIGMA, _SIGMA)
 _BELIEF = (_STAMP, _PLACE, _PLACE, _HEADING, *_COVARIANCE_3, _RATE, _RATE)
 
+_LANDMARK = (_STAMP, _PLACE, _PLACE, *_COVARIANCE_2)
+
 _HEAD = bytes([VERSION])
 FIX_BYTES = 1 + sum(number.width for number in _FIX)
 HEADED_FIX_BYTES = 1 + sum(number.width for number in _HEADED_FIX)
 BELIEF_BYTES = 1 + sum(number.width for number in _BELIEF)
+LANDMARK_BYTES = 1 + sum(number.width for number in _LANDMARK)
 _FIXES = {FIX_BYTES: _FIX, HEADED_FIX_BYTES: _HEADED_FIX}
 _BELIEFS = {BELIEF_BYTES: _BELIEF}
+_LANDMARKS = {LANDMARK_BYTES: _LANDMARK}
 
 
-def help_bytes(message: Belief | Fix) -> int:
-    """The size of the payload of a belief or a fix."""
+def help_bytes(message: Help) -> int:
+    """The size of the payload of a message of help."""
+    if isinstance(message, LandmarkBelief):
+        return LANDMARK_BYTES
     if isinstance(message, Belief):
         return BELIEF_BYTES
     return FIX_BYTES if message.heading_rad is None else HEADED_FIX_BYTES
 
 
-def encode_help(message: Belief | Fix) -> bytes:
-    """The payload of a belief or a fix. A number that is too large becomes the largest count, which
+def encode_help(message: Help) -> bytes:
+    """The payload of a message of help. A number that is too large becomes the largest count, which
     every receiver refuses; speeds are clamped.
 
     Raises ValueError for what no agent sends: NaN, an infinite heading, a negative variance, a
@@ -90,6 +97,8 @@ def encode_help(message: Belief | Fix) -> bytes:
     """
     x, y = _PLACE.clamp(message.x_m * PLACES), _PLACE.clamp(message.y_m * PLACES)
     start = (message.stamp_ns // STAMP_NS, x, y)
+    if isinstance(message, LandmarkBelief):
+        return _pack(_LANDMARK, (*start, *_covariance_2_counts(*message.covariance)))
     if isinstance(message, Fix):
         sensor, observer = message.sensor_covariance, message.observer_covariance
         counts = (*start, *_covariance_2_counts(*sensor), *_covariance_2_counts(*observer))
@@ -105,19 +114,22 @@ def encode_help(message: Belief | Fix) -> bytes:
     return _pack(_BELIEF, (*start, heading, *factor, speed, turn_rate))
 
 
-def decode_help(key: str, payload: bytes) -> Belief | Fix | Refusal:
-    """The belief or fix in a payload under this key, or why there is none."""
+def decode_help(key: str, payload: bytes) -> Help | Refusal:
+    """The message of help in a payload under this key, or why there is none."""
     names = _names_in(key)
     if isinstance(names, Refusal):
         return names
     reason = header_refusal(payload)
     if reason is not None:
         return reason
-    layout = (_FIXES if "observer" in names else _BELIEFS).get(len(payload))
+    layouts = _LANDMARKS if "landmark" in names else _BELIEFS
+    layout = (_FIXES if "observer" in names else layouts).get(len(payload))
     if layout is None:
         return Refusal.GARBAGE
     stamp, x, y, *rest = _unpack(layout, payload)
     place = stamp * STAMP_NS, x / PLACES, y / PLACES
+    if layout is _LANDMARK:
+        return LandmarkBelief(names["robot"], names["landmark"], *place, _covariance_2(*rest))
     if layout is _BELIEF:
         heading, *factor, speed, turn_rate = rest
         rates = speed / RATES, turn_rate / RATES
@@ -135,8 +147,9 @@ _is_name = re.compile(NAME_PATTERN).fullmatch
 
 @lru_cache(maxsize=4096)
 def _names_in(key: str) -> dict[str, str] | Refusal:
-    """The names in the key of a belief or fix."""
-    names = topics.BELIEF.names(key) or topics.FIX.names(key)
+    """The names in the key of a message of help."""
+    found = (topic.names(key) for topic in (topics.BELIEF, topics.FIX, topics.LANDMARK))
+    names = next(filter(None, found), None)
     if names is None:
         return Refusal.WRONG_TYPE
     return names if all(map(_is_name, names.values())) else Refusal.UNKNOWN_ROBOT
@@ -244,7 +257,7 @@ _FIXED = 2 + 1 + 2 + 1 + 2 + 1
 
 
 def sent_bytes(payload: int) -> int:
-    """The most bytes on the sender's link, for a payload of so many bytes (fix or belief)."""
+    """The most bytes on the sender's link, for a payload of so many bytes (of help)."""
     return _FIXED + max(1, -(-payload.bit_length() // 7)) + payload
 
 

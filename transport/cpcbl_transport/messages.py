@@ -1,8 +1,9 @@
-"""All messages, and the wire format of all but fixes and beliefs: a version byte, MessagePack.
+"""All messages, and the wire format of all but those of help: a version byte, MessagePack.
 
 A struct is written as an array with its tag first. Structs grow only by fields with defaults at the
-end, so that an older reader skips what it does not know. Fixes and beliefs have a compact format
-(`compact`). Decoding never raises: what cannot be used is a `Refusal` with a reason.
+end, so that an older reader skips what it does not know. Fixes, beliefs and places of landmarks
+have a compact format (`compact`). Decoding never raises: what cannot be used is a `Refusal` with a
+reason.
 """
 
 import math
@@ -20,6 +21,7 @@ from cpcbl_team.inputs import (
     Belief,
     Fix,
     InitialPose,
+    LandmarkBelief,
     Name,
     Odometry,
     Position,
@@ -64,7 +66,8 @@ class AnnotatedFrame(msgspec.Struct, frozen=True, array_like=True, tag="look"):
 
 class Flow(msgspec.Struct, frozen=True, array_like=True):
     """The messages of one topic from or for one teammate, since the process started. `topic` is
-    fix, belief or alive; `peer` is the teammate, empty for beliefs, which go to all subscribers."""
+    fix, belief, landmark or alive; `peer` is the teammate, empty for what goes to all subscribers:
+    beliefs, and places of landmarks."""
 
     topic: str
     peer: str
@@ -247,7 +250,7 @@ class Truths(msgspec.Struct, frozen=True, array_like=True, tag="truth"):
     robots: tuple[Truth, ...]
 
 
-Help = Belief | Fix
+Help = Belief | Fix | LandmarkBelief
 SensorInput = Odometry | Sightings | Position | InitialPose | Frame
 Tagged = SensorInput | AnnotatedFrame | Status | Track | Pose | Drive | Join | Truths
 Message = Tagged | Help

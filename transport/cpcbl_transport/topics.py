@@ -11,7 +11,15 @@ from enum import Enum, StrEnum
 from functools import lru_cache
 from typing import NamedTuple
 
-from cpcbl_team.inputs import Belief, Fix, InitialPose, Odometry, Position, Sightings
+from cpcbl_team.inputs import (
+    Belief,
+    Fix,
+    InitialPose,
+    LandmarkBelief,
+    Odometry,
+    Position,
+    Sightings,
+)
 from cpcbl_transport import messages
 from cpcbl_transport.messages import LARGEST_FRAME, LARGEST_PAYLOAD, Message
 
@@ -140,6 +148,11 @@ RAN = Topic("ran/<robot>/<how>/<incarnation>", None, Qos.COMMAND)
 BELIEF = Topic("belief/<tier>/<robot>", Belief, Qos.FRESH, subscribers=_MEMBERS)
 # Each sighting of a worse robot that subscribes. The next one is better than a late one
 FIX = Topic("fix/<robot>/<tier>/<observer>", Fix, Qos.FRESH, publishers=_OBSERVER)
+# 1 Hz while a robot subscribes that sees the landmark and knows its place worse: once it has taken
+# the place it subscribes to better tiers alone. The next one is as good as a late one
+LANDMARK = Topic(
+    "landmark/<landmark>/<tier>/<robot>", LandmarkBelief, Qos.FRESH, subscribers=_MEMBERS
+)
 # 1 Hz. For people; it must never delay a fix
 STATUS = Topic(
     "status/<robot>",
@@ -177,13 +190,13 @@ JOIN = Topic(
 TRUTH = Topic("field/truth", messages.Truths, Qos.TELEMETRY, publishers=_FIELD, subscribers=())
 
 TOPICS = (
-    *(ALIVE, RAN, BELIEF, FIX, STATUS, TRACK, POSE),
+    *(ALIVE, RAN, BELIEF, FIX, LANDMARK, STATUS, TRACK, POSE),
     *(IN_ODOMETRY, IN_SIGHTINGS, IN_POSITION, IN_INITIAL_POSE, IN_FRAME, LOOK),
     *(DRIVE, JOIN, TRUTH),
 )
 INPUTS = (IN_ODOMETRY, IN_SIGHTINGS, IN_POSITION, IN_INITIAL_POSE, IN_FRAME)
 """The last part of each key is the tag of its message."""
-COLLABORATION = (Belief, Fix)
+COLLABORATION = (Belief, Fix, LandmarkBelief)
 _BY_TYPE: dict[type[object], Topic] = {
     topic.carries: topic for topic in TOPICS if topic.carries is not None
 }

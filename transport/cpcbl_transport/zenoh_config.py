@@ -118,7 +118,7 @@ def guard_rules(team: Team, speed: float = 1.0) -> dict[str, Any]:
         return {}
     space, faster = topics.namespace(team.name), max(1.0, speed)
     rates = {topics.FIX.at(robot=name): guards.fix_rate_hz for name in team.robots}
-    rates[topics.BELIEF.at()] = guards.belief_rate_hz
+    rates |= {topic.at(): guards.belief_rate_hz for topic in (topics.BELIEF, topics.LANDMARK)}
     rates |= {topics.IN_FRAME.at(robot=name): guards.frame_rate_hz for name in team.robots}
     limits = {topic.at(): _limit(topic, guards) for topic in topics.TOPICS if topic.carries}
     limits["**"] = max(limits.values())

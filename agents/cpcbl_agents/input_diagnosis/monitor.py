@@ -162,15 +162,16 @@ class InputMonitor:
         """Whether odometry, or a pose that was found elsewhere, said so at a judgement."""
         wheels = settings.odometry
         self.inputs["odometry"].scales = wheels.distance_scale, wheels.turn_scale
+        field = team.map_of(robot)
         self._facts = InputFacts(
             robot,
             {},
             tuple(_expected_inputs(settings)),
             team.map.names | frozenset(team.robots),
-            team.map.landmarks,
+            field.landmarks,
             settings.sensor,
             wheels,
-            team.map.bounds(),
+            field.bounds(),
             settings.odometry.timeout_s,
             _start_pose(settings.start),
             pace=max(1.0, speed),

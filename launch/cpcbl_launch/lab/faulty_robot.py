@@ -33,13 +33,12 @@ from msgspec.structs import replace
 from cpcbl_launch.run.processes import PROGRAM
 from cpcbl_launch.run.robot import robot_parser, run_robot_command
 from cpcbl_team.errors import CpcblError, InputError
-from cpcbl_team.inputs import Belief, Fix
+from cpcbl_team.inputs import Fix, LandmarkBelief
 from cpcbl_transport.bus import Bus, BusProxy, Publisher, PublisherProxy
 from cpcbl_transport.compact import decode_help, encode_help
-from cpcbl_transport.messages import Refusal
+from cpcbl_transport.messages import Help, Refusal
 from cpcbl_transport.topics import Qos
 
-Help = Belief | Fix
 VALUE_COUNTS = {
     "bias": 2,
     "overclaim": 3,
@@ -52,7 +51,7 @@ VALUE_COUNTS = {
 }
 JUMP_NS = 2_000_000_000
 STATED_SIGMA_M = 0.001
-_HELP_KEYS = ("fix/", "belief/")
+_HELP_KEYS = ("fix/", "belief/", "landmark/")
 _TEXT = re.compile(
     r"(?P<kind>[a-z]+)(:(?P<values>[^@/]*))?(/(?P<about>[^@/]+))?"
     r"(@(?P<since>[^-@]+)-(?P<until>[^-@]*))?"
@@ -66,7 +65,7 @@ class Fault(NamedTuple):
     values: tuple[float, ...] = ()
     from_s: float = 0.0
     until_s: float = math.inf
-    about: str = ""  # the robot about whom it lies; empty: about all
+    about: str = ""  # the robot or landmark about which it lies; empty: about all
 
     @staticmethod
     def parse(text: str) -> "Fault":
@@ -98,7 +97,7 @@ class FaultInjector:
         """What the robot sends in place of the message."""
         since_s = (message.stamp_ns - self._start_ns) * 1e-9
         is_active = self._fault.from_s <= since_s < self._fault.until_s
-        is_active = is_active and self._fault.about in ("", message.robot)
+        is_active = is_active and self._fault.about in ("", _subject(message))
         if self._fault.kind == "frozen":
             return self._freeze(message, is_active)
         if not is_active:
@@ -129,11 +128,16 @@ class FaultInjector:
         return first * math.cos(direction), first * math.sin(direction)
 
     def _freeze(self, message: Help, is_active: bool) -> Help:
-        key = type(message), message.robot
+        key = type(message), _subject(message)
         if not is_active or key not in self._last_xy_m:
             self._last_xy_m[key] = message.x_m, message.y_m
         x, y = self._last_xy_m[key]
         return replace(message, x_m=x, y_m=y)
+
+
+def _subject(message: Help) -> str:
+    """The robot or landmark that a message is about."""
+    return message.landmark if isinstance(message, LandmarkBelief) else message.robot
 
 
 def _with_stated_sigma(message: Help, sigma_m: float) -> Help:
@@ -141,12 +145,14 @@ def _with_stated_sigma(message: Help, sigma_m: float) -> Help:
     if isinstance(message, Fix):
         position = (variance, 0.0, variance)
         return replace(message, sensor_covariance=position, observer_covariance=position)
+    if isinstance(message, LandmarkBelief):
+        return replace(message, covariance=(variance, 0.0, variance))
     return replace(message, covariance=(variance, 0.0, variance, 0.0, 0.0, variance))
 
 
 def _with_heading(message: Help, for_s: float, turn_deg_s: float, sigma_deg: float) -> Help:
     """A belief, or a fix with a heading, whose heading has turned for so long."""
-    if message.heading_rad is None:
+    if isinstance(message, LandmarkBelief) or message.heading_rad is None:
         return message
     heading = math.remainder(message.heading_rad + math.radians(turn_deg_s * for_s), math.tau)
     message, variance = replace(message, heading_rad=heading), math.radians(sigma_deg) ** 2
@@ -170,7 +176,7 @@ class _FaultyPublisher(PublisherProxy):
 
 
 class FaultyBus(BusProxy):
-    """A bus that changes the fixes and beliefs of the robot `name` when they are sent."""
+    """A bus that changes the help of the robot `name` when they are sent."""
 
     def __init__(self, bus: Bus, fault: Fault, name: str, start_ns: int) -> None:
         super().__init__(bus)

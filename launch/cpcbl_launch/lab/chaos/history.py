@@ -17,7 +17,8 @@ from cpcbl_transport.messages import Flow, Status
 REJOIN_S = 5.0
 BACK_S = 10.0  # help is used so long after its sender's tier was announced, at most
 DISHONEST_SIGMAS, DISHONEST_M, DISHONEST_S = 5.0, 0.5, 3.0
-HELP = ("fix", "belief")
+BY_TIER = ("fix", "belief")  # of the robot; landmarks have tiers of their own
+HELP = (*BY_TIER, "landmark")
 
 
 class Span(NamedTuple):
@@ -102,7 +103,7 @@ def uphill_messages(log: RunLog, robot: str, forged: Sequence[Span] = ()) -> Ite
         own = _tiers(log, robot, *window)
         liars = {s.robot for s in forged if s.from_s <= at_s <= s.until_s + BACK_S}
         for flow in new.heard:
-            if flow.topic not in HELP or flow.peer in liars:
+            if flow.topic not in BY_TIER or flow.peer in liars:
                 continue
             more = flow.messages - before.get((flow.topic, flow.peer), 0)
             theirs = _tiers(log, flow.peer, *window)

@@ -12,6 +12,7 @@ from cpcbl_launch.team.file import builtin_path, load_team
 from cpcbl_launch.team.overrides import with_blind_robots
 from cpcbl_team.config import (
     Field,
+    LandmarkPosition,
     OdometrySettings,
     PositionSensor,
     RobotSettings,
@@ -258,7 +259,23 @@ def _unsurveyed_worlds() -> dict[str, World]:
         team = _with_unsurveyed(_seeing(seeing).team, 0)
         name = f"unsurveyed, clique, {len(seeing)} of 4 see landmarks"
         found[name] = World(team, tuple("abcd"), duration_s=LEARNING_S)
+    for seeing in ("ab", "abcd"):
+        told = _with_guide(_seeing(seeing).team, "a")
+        name = f"unsurveyed, clique, {len(seeing)} of 4 see landmarks, one knows them"
+        found[name] = World(told, tuple("abcd"), duration_s=LEARNING_S)
+    told = _with_guide(_seeing("abcd").team, "a")
+    searching = {n: r if n == "a" else replace(r, start=None) for n, r in told.robots.items()}
+    told = replace(told, robots=searching)
+    world = World(told, tuple("abcd"), duration_s=LEARNING_S, scored_from_s=10.0)
+    found["unsurveyed, clique, one knows them and its start"] = world
     return found
+
+
+def _with_guide(team: Team, guide: str) -> Team:
+    """The team of which one robot alone knows where all landmarks stand."""
+    known = {n: LandmarkPosition(x_m=m.x_m, y_m=m.y_m) for n, m in team.map.landmarks.items()}
+    robots = {**team.robots, guide: replace(team.robots[guide], known_landmarks=known)}
+    return _with_unsurveyed(replace(team, robots=robots), 0)
 
 
 def _with_unsurveyed(team: Team, known: int) -> Team:

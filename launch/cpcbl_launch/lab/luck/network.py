@@ -27,7 +27,7 @@ from cpcbl_transport.topics import Qos
 FIELD, WATCHER = "field", "watcher"  # their sessions have no bad luck
 LEASE_S, RECONNECT_S = 2.0, 0.5  # as Zenoh: a silent session is gone after its lease
 MOST_LATE_COPY_S = 4.0
-HELP, INPUTS = ("fix/", "belief/"), "in/"
+HELP, INPUTS = ("fix/", "belief/", "landmark/"), "in/"
 CUTS: tuple[Kind, ...] = ("cut", "mute", "deaf")
 OnPut = Callable[[str, str, bytes], None]  # called with the session, the key and the payload
 Thing = TypeVar("Thing")

@@ -14,17 +14,18 @@ import msgspec
 from cpcbl_agents.agent import BusEvent, Tick
 from cpcbl_agents.filtering import FilterAgent
 from cpcbl_agents.inbox import INBOX
+from cpcbl_agents.landmark_sharing import UNKNOWN_TIER
 from cpcbl_agents.node import Node
 from cpcbl_agents.robot import Robot
 from cpcbl_launch.lab.luck.network import HELP, Network
 from cpcbl_team.config import Team
-from cpcbl_team.inputs import Belief, Fix, HeadingBelief, Input, Odometry
+from cpcbl_team.inputs import Belief, Fix, HeadingBelief, Input, LandmarkBelief, Odometry
 from cpcbl_team.state import FIX, State
 from cpcbl_team.teammates import MOST_SENDERS
 from cpcbl_team.timeline import HORIZON_NS, Timeline, TimelineRefusal
 from cpcbl_transport import topics
 from cpcbl_transport.compact import decode_help
-from cpcbl_transport.messages import Message, Outgoing, Refusal, Status
+from cpcbl_transport.messages import Help, Message, Outgoing, Refusal, Status
 
 KEPT_NS = 10_000_000_000  # what was used is remembered for so long
 LATEST_NS = HORIZON_NS + 600_000_000  # a belief counts from half a second before its stamp
@@ -61,13 +62,13 @@ class Witness:
         self.delivered += 1
         if key.startswith(HELP):
             message = decode_help(key, payload)
-            if not isinstance(message, Refusal):
+            if not isinstance(message, Refusal | LandmarkBelief):  # its tier is of its place
                 names = topics.FIX.names(key) or topics.BELIEF.names(key) or {}
                 self._help_tiers[_identity(message)] = int(names["tier"])
 
     def note_handled(self, message: Message) -> None:
         self.handled += 1
-        self.helped += isinstance(message, Belief | Fix)
+        self.helped += isinstance(message, Help)
 
     def note_input(self, item: Input, is_used: bool, counted: int) -> None:
         """The timeline took an input or did not; `counted`: how many refusals were counted."""
@@ -150,7 +151,11 @@ class Witness:
 
     def _check_sizes(self, node: Node, state: State) -> None:
         declared = {what: len(keys) for what, keys in self._network.declared[self._name].items()}
-        most = {"subscriptions": 32 + self._most, "publishers": OWN_KEYS + 16 * self._most}
+        marks = len(self._team.map.unsurveyed)
+        most = {
+            "subscriptions": 32 + self._most + UNKNOWN_TIER * marks,
+            "publishers": OWN_KEYS + 16 * self._most + marks,
+        }
         sizes = {
             "tokens": (declared["tokens"], 1),
             "subscriptions": (declared["subscriptions"], most["subscriptions"]),
@@ -212,7 +217,7 @@ def _measured_ns(item: Input) -> int:
 def _text(item: Input) -> str:
     """An input for people."""
     sender = f" of {item.observer}" if isinstance(item, Fix) else ""
-    sender = f" of {item.robot}" if isinstance(item, Belief) else sender
+    sender = f" of {item.robot}" if isinstance(item, Belief | LandmarkBelief) else sender
     return f"{type(item).__name__}{sender} ({item.stamp_ns * 1e-9:.3f} s)"
 
 

@@ -1,0 +1,88 @@
+"""Places of landmarks that travel: which of them a robot tells, and which it asks for.
+
+A landmark that is not on the team's map has a tier, by the sigma of its place. A robot asks for the
+place of a landmark that it sees in better tiers than that of its own knowledge, and tells what it
+has found or known itself while somebody asks. Whoever has taken a place asks for better ones alone,
+so nothing is sent for long, and no robot's word comes back to it as a better one.
+"""
+
+import math
+from collections.abc import Mapping
+from typing import Final
+
+from cpcbl_team.inputs import LandmarkBelief, Sightings
+from cpcbl_team.tiers import tier_of
+
+TIER_WIDTH: Final = 2.0  # ratio of the sigmas of two tiers
+UNKNOWN_TIER: Final = 8  # beyond 1.28 m a place is not told
+ROUNDING: Final = 1.01  # by which a sigma on the wire may be larger
+IN_SIGHT_NS: Final = 10_000_000_000  # a place is asked for so long after its landmark was seen
+REPEAT_NS: Final = 1_000_000_000  # between two words on a landmark of the same tier
+
+
+def landmark_tier(place: LandmarkBelief, rounding: float = 1.0) -> int:
+    """The tier of a landmark's place. `rounding`: by how much its sigma may have grown."""
+    xx, _, yy = place.covariance
+    sigma_m = math.sqrt(0.5 * (xx + yy)) / rounding
+    return min(tier_of(sigma_m, TIER_WIDTH), UNKNOWN_TIER)
+
+
+class LandmarkSharing:
+    """What one robot tells of landmarks, and what it asks for."""
+
+    def __init__(self, robot: str, names: frozenset[str]) -> None:
+        """`names`: of the landmarks that are not on the team's map."""
+        self._robot, self._names = robot, names
+        self._seen_ns: dict[str, int] = {}
+        self._sent: dict[str, tuple[int, int]] = {}  # tier and time of the last word on each
+        self._places: Mapping[str, LandmarkBelief] = {}
+        self.asked_for: frozenset[str] = frozenset()
+        """The landmarks whose places somebody asks for in the tiers in which this robot knows
+        them."""
+
+    @property
+    def tiers(self) -> dict[str, int]:
+        """The landmarks whose places this robot knows of its own, and the tiers in which it tells
+        them."""
+        own = (place for place in self._places.values() if place.robot == self._robot)
+        tiers = {place.landmark: landmark_tier(place) for place in own}
+        return {name: tier for name, tier in tiers.items() if tier < UNKNOWN_TIER}
+
+    def see(self, frame: Sightings) -> None:
+        """The robot has seen this."""
+        for sighting in frame.sightings:
+            if sighting.id in self._names:
+                self._seen_ns[sighting.id] = frame.stamp_ns
+
+    def update(self, places: tuple[LandmarkBelief, ...]) -> None:
+        """The robot knows these places now."""
+        self._places = {place.landmark: place for place in places}
+
+    def wanted(self, now_ns: int) -> frozenset[tuple[str, int]]:
+        """The landmarks in sight, with the tiers in which the robot asks for their places."""
+        tiers = {name: landmark_tier(place, ROUNDING) for name, place in self._places.items()}
+        return frozenset(
+            (name, tier)
+            for name, seen_ns in self._seen_ns.items()
+            if now_ns - seen_ns <= IN_SIGHT_NS
+            for tier in range(tiers.get(name, UNKNOWN_TIER))
+        )
+
+    def next_word(self, now_ns: int) -> tuple[LandmarkBelief, int] | None:
+        """What is to be told next, if anything, and the time of the last word on it (0: none). The
+        most certain place comes first, then the one that waits longest. One at a time: routers drop
+        what follows too soon."""
+        due = []
+        for name, tier in self.tiers.items():
+            last_tier, last_ns = self._sent.get(name, (UNKNOWN_TIER, 0))
+            is_due = tier < last_tier or now_ns - last_ns >= REPEAT_NS
+            if is_due and name in self.asked_for:
+                due.append((tier, last_ns, name))
+        if not due:
+            return None
+        _, last_ns, name = min(due)
+        return self._places[name], last_ns
+
+    def note_sent(self, told: LandmarkBelief) -> None:
+        """This was sent."""
+        self._sent[told.landmark] = landmark_tier(told), told.stamp_ns

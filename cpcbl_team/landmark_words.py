@@ -1,0 +1,62 @@
+"""What teammates say of landmarks whose places are not on the map, as one robot uses it.
+
+A word is merged once, as it comes, into the place that the robot has found itself. Of a landmark of
+which it has no place the word is kept, and the landmark is then like a teammate that stands there:
+as long as the word is much better than what the robot would find, or the robot is lost. In between
+it finds the place itself, for its own place is known better in relation to its own pose.
+"""
+
+from collections.abc import Mapping
+
+from cpcbl_team.common_error_filter import CommonErrorFilter
+from cpcbl_team.config import Field, LocalizationSettings
+from cpcbl_team.fusion import chi_square_bounds
+from cpcbl_team.gaussian import Covariance2
+from cpcbl_team.inputs import LandmarkBelief
+from cpcbl_team.state import State, with_landmark
+from cpcbl_team.teammates import TeammateScreen
+
+MUCH_BETTER = 0.25  # of the variance of the robot's own position
+
+
+class LandmarkWords:
+    """Takes what teammates say of landmarks."""
+
+    def __init__(
+        self,
+        settings: LocalizationSettings,
+        field: Field,
+        common: CommonErrorFilter | None,
+        screen: TeammateScreen,
+    ) -> None:
+        self._unsurveyed = frozenset(field.unsurveyed)
+        self._passive = settings.collaboration.passive
+        self._common, self._screen = common, screen
+        _, self._gate = chi_square_bounds(settings.localizer.gate_probability)
+
+    def usable(self, state: State) -> Mapping[str, LandmarkBelief]:
+        """The words by which the robot takes landmarks for known."""
+        told = state.memory.teammates.trusted_landmarks
+        if not told or self._common is None or state.lost:
+            return told
+        own = state.estimate.covariance
+        most = MUCH_BETTER * (own.xx + own.yy)
+        return {n: t for n, t in told.items() if t.covariance[0] + t.covariance[2] <= most}
+
+    def add(self, state: State, told: LandmarkBelief) -> State:
+        """The state after a teammate's word. Pure, and at the state's own time: a landmark stands
+        still."""
+        if told.landmark not in self._unsurveyed or not self._passive:
+            return state
+        state = with_landmark(state, told)
+        common = self._common
+        if common is None or state.lost or not common.has_found(state, told.landmark):
+            return state
+        covariance = self._screen.cautious(state, told.robot, Covariance2(*told.covariance))
+        nis = common.word_nis(state, told, covariance)
+        state, is_trusted = self._screen.screen_word(state, told, nis)
+        if not is_trusted:
+            return state
+        if nis > self._gate:
+            return state.counted("landmark_gated")
+        return common.with_word(state, told, covariance)
