@@ -150,6 +150,8 @@ class TeammateScreen:
         whether it may be used. `nis`: of the two places, chi-square of two degrees of freedom."""
         if not self.is_active:
             return state, True
+        memory = state.memory.teammates
+        state = with_teammates(state, memory._replace(last_report_ns=state.stamp_ns))
         report = TeammateReport(state.stamp_ns, nis, is_guest=self._is_guest(told.robot))
         return self._assess(state, told.robot, report, told.landmark)
 

@@ -1,4 +1,4 @@
-"""Fixes and beliefs with their keys, and covariances of every shape."""
+"""Messages of help with their keys, and covariances of every shape."""
 
 import math
 from collections.abc import Sequence
@@ -8,7 +8,7 @@ import numpy as np
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from cpcbl_team.inputs import Belief, Fix
+from cpcbl_team.inputs import Belief, Fix, LandmarkBelief
 from cpcbl_transport.compact import (
     decode_help,
     encode_help,
@@ -25,7 +25,8 @@ HEADED = replace(
     FIX, heading_rad=-2.5, heading_sensor_variance=0.01, heading_observer_variance=0.0004
 )
 BELIEF = Belief("r1", NOW, 1.0, -2.0, 0.5, (*PLANE, 0.002, -0.003, 0.01), 0.3, -0.1)
-FIX_KEY, BELIEF_KEY = "fix/r2/3/r1", "belief/3/r1"
+LANDMARK = LandmarkBelief("r1", "oak", NOW, 1.0, -2.0, PLANE)
+FIX_KEY, BELIEF_KEY, LANDMARK_KEY = "fix/r2/3/r1", "belief/3/r1", "landmark/oak/3/r1"
 RATIO = 200.0
 ANGLES = st.floats(-math.pi, math.pi)
 SIGMAS = st.floats(math.log(1e-3), math.log(10.0)).map(math.exp)
@@ -35,6 +36,8 @@ STAMPS = st.integers(-(10**18), 4 * 10**18)
 
 
 def key_of(message: Help) -> str:
+    if isinstance(message, LandmarkBelief):
+        return LANDMARK_KEY
     return FIX_KEY if isinstance(message, Fix) else BELIEF_KEY
 
 
@@ -100,6 +103,13 @@ FIXES = st.builds(
     PLANES,
     PLANES,
     st.just(()) | st.tuples(ANGLES, VARIANCES, VARIANCES),
+)
+LANDMARKS = st.builds(
+    lambda stamp, x, y, c: LandmarkBelief("r1", "oak", stamp, x, y, triangle(c)),
+    STAMPS,
+    PLACES,
+    PLACES,
+    PLANES,
 )
 BELIEFS = st.builds(
     lambda stamp, x, y, heading, c, *rates: Belief("r1", stamp, x, y, heading, triangle(c), *rates),

@@ -4,7 +4,16 @@ import msgspec
 
 from cpcbl_team.config.sensors import PositionSensorModel
 from cpcbl_team.config.team import StartModel
-from cpcbl_team.inputs import Belief, Fix, InitialPose, Odometry, Position, Sighting, Sightings
+from cpcbl_team.inputs import (
+    Belief,
+    Fix,
+    InitialPose,
+    LandmarkBelief,
+    Odometry,
+    Position,
+    Sighting,
+    Sightings,
+)
 from cpcbl_transport.messages import (
     AnnotatedFrame,
     Drive,
@@ -62,6 +71,7 @@ VALID = (
     *(ODOMETRY, SIGHTINGS, POSITION, INITIAL_POSE, FRAME),
     *(LOOK, STATUS, TRACK, POSE, DRIVE, JOIN, TRUTHS),
 )
+LANDMARK = LandmarkBelief("r1", "oak", NOW, 1.0, 2.0, (0.04, 0.01, 0.09))
 BELIEF = Belief("r1", NOW, 1.0, 2.0, 0.5, COVARIANCE, 0.25, -0.1)
 FIX = Fix("r2", "r1", NOW, 1.5, -2.5, (0.04, 0.01, 0.09), (0.01, 0.0, 0.02))
 HEADED_FIX = msgspec.structs.replace(

@@ -16,6 +16,7 @@ from support.compact import (
     FIX,
     FIXES,
     HEADED,
+    LANDMARKS,
     NOW,
     matrix,
     there_and_back,
@@ -23,11 +24,12 @@ from support.compact import (
     turned,
 )
 
-from cpcbl_team.inputs import Belief, Fix
+from cpcbl_team.inputs import Belief, Fix, LandmarkBelief
 from cpcbl_transport.compact import (
     BELIEF_BYTES,
     FIX_BYTES,
     HEADED_FIX_BYTES,
+    LANDMARK_BYTES,
     encode_help,
     help_bytes,
     sent_bytes,
@@ -68,15 +70,19 @@ def test_a_belief_and_a_fix_are_at_most_40_bytes() -> None:
     assert sent_bytes(HEADED_FIX_BYTES) <= 60
 
 
+def test_the_place_of_a_landmark_takes_at_most_40_bytes_on_the_link() -> None:
+    assert sent_bytes(LANDMARK_BYTES) == 35
+
+
 @examples(100)
-@given(FIXES | BELIEFS)
-def test_every_fix_and_every_belief_has_its_size(message: Help) -> None:
+@given(FIXES | BELIEFS | LANDMARKS)
+def test_every_message_of_help_has_its_size(message: Help) -> None:
     size = len(encode_help(message))
     assert size == help_bytes(message)
     if isinstance(message, Fix):
         assert size == (FIX_BYTES if message.heading_rad is None else HEADED_FIX_BYTES)
     else:
-        assert size == BELIEF_BYTES
+        assert size == (BELIEF_BYTES if isinstance(message, Belief) else LANDMARK_BYTES)
 
 
 def test_a_worked_example() -> None:
@@ -106,6 +112,24 @@ def test_a_worked_example() -> None:
     assert again.covariance == pytest.approx(covariance, rel=0.003)
 
 
+def test_a_worked_example_of_a_landmark() -> None:
+    covariance = (0.04**2, 0.04 * 0.03, 0.03**2 + 0.03**2)
+    message = LandmarkBelief("r1", "oak", SECOND, 1.5, -2.0, covariance)
+    written = [
+        "02",  # version
+        "40 42 0f 00 00 00 00",  # 1,000,000 us
+        "f0 49 02 00 00",  # x: 150,000 times 10 um
+        "c0 f2 fc ff ff",  # y: -200,000 times 10 um
+        "28 3d",  # x: 15,656 steps, 4 cm
+        "7f 3b",  # y, given x: 15,231 steps, 3 cm
+        "00 08 00",  # 2048 / 2048: y rises by one such sigma with one of x
+    ]
+    assert encode_help(message).hex(" ") == " ".join(written)
+    again = there_and_back(message)
+    assert (again.robot, again.landmark, again.x_m, again.y_m) == ("r1", "oak", 1.5, -2.0)
+    assert again.covariance == pytest.approx(covariance, rel=0.003)
+
+
 def test_a_worked_example_of_a_heading() -> None:
     """It stands behind a fix as it was; an exact variance is said as 1 urad, raised by 0.04 %."""
     message = replace(FIX, heading_rad=-math.pi / 2.0, heading_sensor_variance=0.001**2)
@@ -122,7 +146,7 @@ def test_a_worked_example_of_a_heading() -> None:
 
 
 @examples(300)
-@given(FIXES | BELIEFS)
+@given(FIXES | BELIEFS | LANDMARKS)
 def test_rounding_costs_less_than_one_percent_of_sigma(message: Help) -> None:
     again = there_and_back(message)
     off = [again.x_m - message.x_m, again.y_m - message.y_m]
@@ -131,6 +155,7 @@ def test_rounding_costs_less_than_one_percent_of_sigma(message: Help) -> None:
         assert_heading_just_more(message, again)
     else:
         fields = ["covariance"]
+    if isinstance(message, Belief):
         off.append(math.remainder(again.heading_rad - message.heading_rad, math.tau))
         assert abs(again.speed_m_s - message.speed_m_s) <= 0.0005 + 1e-9
         assert abs(again.turn_rate_rad_s - message.turn_rate_rad_s) <= 0.0005 + 1e-9

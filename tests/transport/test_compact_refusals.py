@@ -18,6 +18,9 @@ from support.compact import (
     FIX_KEY,
     FIXES,
     HEADED,
+    LANDMARK,
+    LANDMARK_KEY,
+    LANDMARKS,
     NOW,
     key_of,
     matrix,
@@ -30,6 +33,7 @@ from cpcbl_transport.compact import (
     BELIEF_BYTES,
     FIX_BYTES,
     HEADED_FIX_BYTES,
+    LANDMARK_BYTES,
     decode_help,
     encode_help,
 )
@@ -44,8 +48,8 @@ from cpcbl_transport.messages import (
 
 per_kind = pytest.mark.parametrize(
     ("key", "message"),
-    [(FIX_KEY, FIX), (FIX_KEY, HEADED), (BELIEF_KEY, BELIEF)],
-    ids=["fix", "fix with heading", "belief"],
+    [(FIX_KEY, FIX), (FIX_KEY, HEADED), (BELIEF_KEY, BELIEF), (LANDMARK_KEY, LANDMARK)],
+    ids=["fix", "fix with heading", "belief", "landmark"],
 )
 
 
@@ -184,7 +188,7 @@ def test_help_from_the_future_is_refused_beyond_the_tolerance(key: str, message:
     assert refusal(again, NOW - FUTURE_NS - 1) is Refusal.FUTURE
 
 
-def assert_usable(read: Belief | Fix | Refusal) -> None:
+def assert_usable(read: Help | Refusal) -> None:
     """Whatever was read is refused or has finite numbers and covariances."""
     if isinstance(read, Refusal) or refusal(read, NOW) is not None:
         return
@@ -204,7 +208,7 @@ def assert_usable(read: Belief | Fix | Refusal) -> None:
 @examples(500)
 @given(st.binary(max_size=60))
 def test_random_bytes_never_raise(noise: bytes) -> None:
-    for key in (FIX_KEY, BELIEF_KEY):
+    for key in (FIX_KEY, BELIEF_KEY, LANDMARK_KEY):
         assert_usable(decode_help(key, noise))
         assert_usable(decode_help(key, bytes([VERSION]) + noise))
 
@@ -216,16 +220,19 @@ def test_random_bytes_never_raise(noise: bytes) -> None:
         lambda b: (FIX_KEY, b)
     )
     | st.binary(min_size=BELIEF_BYTES - 1, max_size=BELIEF_BYTES - 1).map(lambda b: (BELIEF_KEY, b))
+    | st.binary(min_size=LANDMARK_BYTES - 1, max_size=LANDMARK_BYTES - 1).map(
+        lambda b: (LANDMARK_KEY, b)
+    )
 )
 def test_any_bytes_of_the_right_length_are_a_gaussian(keyed: tuple[str, bytes]) -> None:
     read = decode_help(keyed[0], bytes([VERSION]) + keyed[1])
-    assert isinstance(read, Fix | Belief)
+    assert isinstance(read, Help)
     assert refusal(read, NOW) is not Refusal.NOT_FINITE
     assert_usable(read)
 
 
 @examples(300)
-@given(FIXES | BELIEFS, st.data())
+@given(FIXES | BELIEFS | LANDMARKS, st.data())
 def test_a_flipped_bit_never_raises(message: Help, data: st.DataObject) -> None:
     payload = bytearray(encode_help(message))
     bit = data.draw(st.integers(0, 8 * len(payload) - 1))

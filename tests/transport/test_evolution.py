@@ -11,7 +11,7 @@ import pytest
 from support import messages as samples
 
 from cpcbl_team.config import OdometrySettings, PositionSensor, RobotSettings, SensorSettings, Start
-from cpcbl_team.inputs import Belief, Fix
+from cpcbl_team.inputs import Belief, Fix, LandmarkBelief
 from cpcbl_transport import topics
 from cpcbl_transport.compact import decode_help, encode_help
 from cpcbl_transport.messages import (
@@ -28,7 +28,11 @@ from cpcbl_transport.messages import (
 )
 
 BY_TYPE: dict[Any, Tagged] = {type(m): m for m in samples.VALID}
-HELP: dict[Any, Help] = {Belief: samples.BELIEF, Fix: samples.FIX}
+HELP: dict[Any, Help] = {
+    Belief: samples.BELIEF,
+    Fix: samples.FIX,
+    LandmarkBelief: samples.LANDMARK,
+}
 GOLDEN: dict[str, str] = json.loads(
     Path(__file__).with_name("golden_messages.json").read_text(encoding="utf-8")
 )
@@ -37,6 +41,7 @@ NEW = ("new", {"and": ["nested"]}, 3.5)
 KEYS = {
     Belief: topics.BELIEF.at(tier=3, robot="r1"),
     Fix: topics.FIX.at(robot="r2", tier=3, observer="r1"),
+    LandmarkBelief: topics.LANDMARK.at(landmark="oak", tier=3, robot="r1"),
 }
 
 of_every_tagged_type = pytest.mark.parametrize("kind", get_args(Tagged))
@@ -147,7 +152,12 @@ def test_the_bytes_of_a_message_are_frozen(kind: type[Tagged]) -> None:
 
 @pytest.mark.parametrize(
     ("message", "name"),
-    [(samples.BELIEF, "belief"), (samples.FIX, "fix"), (samples.HEADED_FIX, "fix with heading")],
+    [
+        (samples.BELIEF, "belief"),
+        (samples.FIX, "fix"),
+        (samples.HEADED_FIX, "fix with heading"),
+        (samples.LANDMARK, "landmark"),
+    ],
 )
 def test_the_bytes_of_a_fix_and_a_belief_are_frozen(message: Help, name: str) -> None:
     assert encode_help(message).hex() == GOLDEN[name]

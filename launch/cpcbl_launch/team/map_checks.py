@@ -4,7 +4,8 @@ import math
 from collections.abc import Iterator
 
 from cpcbl_team.common_error_filter import considers_common_errors
-from cpcbl_team.config import Team
+from cpcbl_team.config import LandmarkPosition, Team
+from cpcbl_team.errors import nearest_name
 
 LARGEST_SHARE = 0.25  # of the map's size, that its own errors may have
 
@@ -18,13 +19,14 @@ def map_problems(team: Team) -> Iterator[str]:
         if wall.from_m == wall.to_m:
             yield f"map.walls.{name}: has no length; move to_m away from from_m"
     for name, mark in team.map.landmarks.items():
-        if mark.covariance_m2 is None:
-            continue
-        key, (xx, xy, yy) = f"map.landmarks.{name}.covariance_m2", mark.covariance_m2
-        if min(xx, yy) < 0.0 or xy * xy > xx * yy:
-            yield f"{key}: [{xx:g}, {xy:g}, {yy:g}] is no covariance; write xx, xy, yy in m^2"
-        elif mark.sigma_m:
-            yield f"{key}: there is sigma_m, too; remove one of the two"
+        yield from _covariance_problems(f"map.landmarks.{name}", mark)
+    for robot, settings in team.robots.items():
+        for name, place in settings.known_landmarks.items():
+            key = f"robots.{robot}.known_landmarks.{name}"
+            yield from _covariance_problems(key, place)
+            if name not in team.map.unsurveyed:
+                near = nearest_name(name, team.map.unsurveyed)
+                yield f"{key}: map.unsurveyed has no {name!r}; write {near or 'it there, too'}"
     simulated = [n for n, robot in team.robots.items() if robot.source == "simulated"]
     for name, unsurveyed in team.map.unsurveyed.items():
         if simulated and unsurveyed.true_m is None:
@@ -32,6 +34,16 @@ def map_problems(team: Team) -> Iterator[str]:
                 f"map.unsurveyed.{name}.true_m: the simulated field needs it; write where the"
                 " landmark stands, which no robot is told"
             )
+
+
+def _covariance_problems(key: str, mark: LandmarkPosition) -> Iterator[str]:
+    if mark.covariance_m2 is None:
+        return
+    key, (xx, xy, yy) = f"{key}.covariance_m2", mark.covariance_m2
+    if min(xx, yy) < 0.0 or xy * xy > xx * yy:
+        yield f"{key}: [{xx:g}, {xy:g}, {yy:g}] is no covariance; write xx, xy, yy in m^2"
+    elif mark.sigma_m:
+        yield f"{key}: there is sigma_m, too; remove one of the two"
 
 
 def map_warnings(team: Team) -> Iterator[str]:
@@ -47,13 +59,15 @@ def map_warnings(team: Team) -> Iterator[str]:
     if not team.map.unsurveyed:
         return
     for name, robot in team.robots.items():
-        if robot.sensor.sees_landmarks and not considers_common_errors(robot):
+        has_all = team.map.unsurveyed.keys() <= robot.known_landmarks.keys()
+        if robot.sensor.sees_landmarks and not has_all and not considers_common_errors(robot):
             yield (
                 f"robots.{name}.localizer.variant: {robot.localizer.variant} does not find"
                 " landmarks that nobody has surveyed; use variant joint"
             )
     has_frame = bool(team.map.landmarks or team.map.walls)
-    has_frame = has_frame or any(r.start or r.position_sensor for r in team.robots.values())
+    knows = (r.start or r.position_sensor or r.known_landmarks for r in team.robots.values())
+    has_frame = has_frame or any(knows)
     if not has_frame and all(robot.source != "mrclam" for robot in team.robots.values()):
         yield (
             "map.unsurveyed: no robot knows its start, and nothing else is on the map, so robots"

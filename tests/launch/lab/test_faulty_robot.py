@@ -125,7 +125,9 @@ def test_headings_turn_and_positions_stay() -> None:
     assert lie.heading_rad == pytest.approx(0.1 + math.radians(4.0))
     assert lie.heading_observer_variance == pytest.approx(math.radians(0.5) ** 2)
     assert (lie.x_m, lie.y_m) == (with_heading.x_m, with_heading.y_m)
-    assert faulty.alter(belief(12.0)).heading_rad == pytest.approx(math.radians(4.0))
+    turned = faulty.alter(belief(12.0))
+    assert isinstance(turned, Belief)
+    assert turned.heading_rad == pytest.approx(math.radians(4.0))
 
 
 def test_jumps_last_two_seconds_and_are_as_far_as_stated() -> None:

@@ -1,0 +1,219 @@
+"""Places of landmarks travel from the robots that know them to those that see them."""
+
+import math
+from typing import Any
+
+import msgspec
+import pytest
+from support.buses import SECOND, TeamOnBus, robot_at, saw, team_of
+from support.wired_team import repeat_until, seen_between, wired
+
+from cpcbl_agents.landmark_sharing import UNKNOWN_TIER, LandmarkSharing, landmark_tier
+from cpcbl_team.config import (
+    BudgetSettings,
+    CollaborationSettings,
+    Field,
+    LandmarkPosition,
+    Start,
+    Team,
+    Unsurveyed,
+)
+from cpcbl_team.inputs import LandmarkBelief, Sighting, Sightings
+from cpcbl_transport import topics
+from cpcbl_transport.compact import LANDMARK_BYTES, sent_bytes
+from cpcbl_transport.messages import Flow
+
+PLACES = {"oak": (4.0, 1.0), "elm": (3.0, -2.0), "ash": (-2.0, 3.0)}
+KNOWN = {name: LandmarkPosition(x_m=x, y_m=y) for name, (x, y) in PLACES.items()}
+HERE = {"guide": (0.0, 0.0), "me": (1.0, 0.5)}
+
+
+def team(guide: dict[str, Any] | None = None, me: dict[str, Any] | None = None) -> Team:
+    """`guide` knows three landmarks that are not on the map; `me` does not, nor its own pose."""
+    robots = {name: robot_at(*place, sigma_m=0.05) for name, place in HERE.items()}
+    changes: dict[str, dict[str, Any]] = {
+        "guide": {"known_landmarks": KNOWN, **(guide or {})},
+        "me": {"start": None} if me is None else me,
+    }
+    field = Field(unsurveyed=dict.fromkeys(PLACES, Unsurveyed()))
+    robots = {n: msgspec.structs.replace(r, **changes[n]) for n, r in robots.items()}
+    return msgspec.structs.replace(team_of(**robots), map=field)
+
+
+def look(stand: TeamOnBus, *robots: str, seconds: float = 1.0) -> None:
+    """These robots, or all, see the landmarks five times a second."""
+    for _ in range(round(5 * seconds)):
+        stand.stand_still(0.2)
+        for name in robots or stand.robots:
+            seen = [seen_between(n, HERE[name], place) for n, place in PLACES.items()]
+            stand.sightings(name, saw(stand.now_ns, *seen))
+        stand.step()
+
+
+def asked_for(stand: TeamOnBus, robot: str) -> set[tuple[str, int]]:
+    """The landmarks and tiers to which a robot subscribes."""
+    interests = stand.robots[robot].collaboration.interests
+    assert interests is not None
+    return set(interests.landmarks)
+
+
+def words(stand: TeamOnBus, robot: str) -> list[Flow]:
+    flows = stand.robots[robot].collaboration.counters.flows()
+    return [flow for flow in flows if flow.topic == "landmark"]
+
+
+def test_a_robot_without_map_and_start_gets_the_map_from_one_that_has_it() -> None:
+    stand = TeamOnBus(team())
+    stand.stand_still(1.0)
+    assert stand.robots["me"].collaboration.latest.lost  # type: ignore[union-attr]
+    look(stand, seconds=4.0)
+    latest = stand.robots["me"].collaboration.latest
+    assert latest is not None
+    assert not latest.lost
+    assert math.dist(latest.estimate.pose[:2], HERE["me"]) < 0.05
+    assert {place.landmark for place in stand.robots["me"].filter.places} == set(PLACES)
+
+
+def test_each_place_is_told_once_and_then_nothing_is_asked_for() -> None:
+    stand = TeamOnBus(team())
+    ear = stand.ear("landmark/**")
+    ear.close()
+    look(stand, seconds=10.0)
+    (flow,) = words(stand, "guide")
+    assert flow.messages == len(PLACES)
+    assert flow.bytes == flow.messages * sent_bytes(LANDMARK_BYTES)
+    assert asked_for(stand, "me") == set()
+    assert words(stand, "me") == []
+
+
+def test_nothing_is_told_about_landmarks_that_nobody_sees() -> None:
+    stand = TeamOnBus(team())
+    look(stand, "guide", seconds=5.0)
+    assert words(stand, "guide") == []
+    assert asked_for(stand, "me") == set()
+
+
+def test_a_landmark_that_was_not_seen_for_long_is_not_asked_for() -> None:
+    stand = TeamOnBus(team(), here=["me"])
+    look(stand, "me")
+    everything = {(name, tier) for name in PLACES for tier in range(UNKNOWN_TIER)}
+    assert asked_for(stand, "me") == everything
+    stand.stand_still(10.5)
+    assert asked_for(stand, "me") == set()
+
+
+def test_a_robot_whose_own_places_are_as_good_asks_for_better_ones_alone() -> None:
+    stand = TeamOnBus(team(me={}), here=["me"])
+    look(stand, "me", seconds=5.0)
+    tiers = stand.robots["me"].collaboration.landmarks.tiers
+    assert set(tiers) == set(PLACES)
+    assert asked_for(stand, "me") == {(n, t) for n, best in tiers.items() for t in range(best)}
+
+
+def test_without_unsurveyed_landmarks_nothing_is_declared() -> None:
+    plain = team_of(me=robot_at(0.0, 0.0), mate=robot_at(1.0, 0.0))
+    stand = TeamOnBus(plain)
+    stand.stand_still(2.0)
+    for name in ("me", "mate"):
+        assert asked_for(stand, name) == set()
+        assert stand.robots[name].collaboration.landmarks.tiers == {}
+
+
+@pytest.mark.parametrize("rules", [{"passive": False}, {"after_s": 60.0}], ids=str)
+def test_without_collaboration_no_place_is_told(rules: dict[str, Any]) -> None:
+    settings = {"collaboration": CollaborationSettings(**rules)}
+    stand = TeamOnBus(team(guide=settings))
+    look(stand, seconds=5.0)
+    assert words(stand, "guide") == []
+
+
+def test_a_lost_robot_tells_no_place_that_it_found() -> None:
+    stand = TeamOnBus(team(guide={"start": Start(x_m=0.0, y_m=0.0, known=False)}), here=["guide"])
+    ear = stand.ear("landmark/**")
+    stand.stand_still(5.0)
+    assert ear.samples == []
+
+
+def test_the_budget_holds_for_places_too() -> None:
+    budget = BudgetSettings(messages_per_minute=2.0)
+    stand = TeamOnBus(team(guide={"collaboration": CollaborationSettings(budget=budget)}))
+    ear = stand.ear("landmark/**")  # somebody who never has enough
+    look(stand, "guide", seconds=30.0)
+    (flow,) = words(stand, "guide")
+    assert 0 < flow.messages <= 3
+    assert len(ear.samples) == flow.messages
+    assert flow.over_budget > 0
+
+
+def test_a_word_on_what_is_no_landmark_of_the_team_is_counted() -> None:
+    stand = TeamOnBus(team(), here=["me"])
+    odd = LandmarkBelief("guide", "box", stand.now_ns, 1.0, 2.0, (0.01, 0.0, 0.01))
+    stand.put(topics.LANDMARK.at(landmark="box", tier=3, robot="guide"), odd)
+    stand.stand_still(0.2)
+    look(stand, "me")
+    key = topics.LANDMARK.at(landmark="oak", tier=0, robot="me")
+    stand.put(key, msgspec.structs.replace(odd, robot="me", landmark="oak"))
+    stand.stand_still(0.2)
+    counts = stand.nodes["me"].counts + stand.robots["me"].counts
+    assert counts["own_message"] == 1
+    assert stand.robots["me"].filter.places == ()
+
+
+def test_over_zenoh_the_map_arrives_and_the_link_is_silent_afterwards() -> None:
+    with wired(team()) as robots:
+        robots.stand.stand_still(1.0)
+
+        def is_found() -> bool:
+            latest = robots.stand.robots["me"].collaboration.latest
+            return latest is not None and not latest.lost
+
+        repeat_until(lambda: look(robots.stand, seconds=0.2), is_found)
+        repeat_until(
+            lambda: look(robots.stand, seconds=0.2), lambda: not asked_for(robots.stand, "me")
+        )
+
+
+# What is told, and when --------------------------------------------------------------------------
+
+
+def place(name: str, sigma_m: float, robot: str = "me") -> LandmarkBelief:
+    return LandmarkBelief(robot, name, 0, 1.0, 2.0, (sigma_m**2, 0.0, sigma_m**2))
+
+
+def test_tiers_of_places() -> None:
+    assert [landmark_tier(place("oak", s)) for s in (0.0, 0.01, 0.02, 0.021, 1.28, 1.3, 9.0)] == [
+        *(0, 0, 1, 2, 7, 8, 8)
+    ]
+
+
+def test_the_best_place_is_told_first_and_each_again_after_a_second() -> None:
+    sharing = LandmarkSharing("me", frozenset(PLACES))
+    sharing.update((place("oak", 0.1), place("elm", 0.02), place("ash", 0.01, "mate")))
+    sharing.asked_for = frozenset(PLACES)
+    told = []
+    for k in range(1, 15):
+        found = sharing.next_word(k * SECOND // 10)
+        if found is not None:
+            word = msgspec.structs.replace(found[0], stamp_ns=k * SECOND // 10)
+            sharing.note_sent(word)
+            told.append((k, word.landmark))
+    assert told == [(1, "elm"), (2, "oak"), (11, "elm"), (12, "oak")]
+
+
+def test_a_place_of_a_better_tier_is_told_at_once() -> None:
+    sharing = LandmarkSharing("me", frozenset(PLACES))
+    sharing.asked_for = frozenset(PLACES)
+    sharing.update((place("oak", 0.1),))
+    first = sharing.next_word(SECOND)
+    assert first is not None
+    sharing.note_sent(msgspec.structs.replace(first[0], stamp_ns=SECOND))
+    assert sharing.next_word(SECOND + 1) is None
+    sharing.update((place("oak", 0.03),))
+    assert sharing.next_word(SECOND + 1) is not None
+
+
+def test_what_rounding_on_the_wire_adds_is_no_reason_to_ask_again() -> None:
+    sharing = LandmarkSharing("me", frozenset(PLACES))
+    sharing.see(Sightings(SECOND, (Sighting("oak", 1.0, 0.0), Sighting("mate", 1.0, 0.0))))
+    sharing.update((place("oak", 0.02 * 1.005, "mate"),))
+    assert sharing.wanted(SECOND) == {("oak", 0)}
