@@ -38,7 +38,8 @@ class FrameEstimate(NamedTuple):
 
 
 class LandmarkPlaces(NamedTuple):
-    """Where the filter takes the landmarks to be that are not on the team's map."""
+    """Where landmarks are that are not on the team's map: as the robot itself has found them or knew
+    them before, and as teammates have said."""
 
     stamp_ns: int
     places: tuple[LandmarkBelief, ...]

@@ -179,17 +179,17 @@ class FilterAgent:
         return PoseEstimate(state.stamp_ns, state.reported, state.lost, speed, turn_rate)
 
     def _landmark_places(self, now_ns: int) -> list[LandmarkPlaces]:
-        """Where the shared landmarks are; nothing where there are none."""
+        """Where the shared landmarks are, by this robot and by others; nothing without any."""
         if not self._shared:
             return []
         state = self.timeline.state
         common, told = state.common_errors, state.memory.teammates.trusted_landmarks
-        places = []
+        places = list(told.values())
         for name in self._shared:
-            found = map_object(self._field, name, common, told)
+            found = map_object(self._field, name, common)
             if found is not None:
-                who, (x, y, (xx, xy, yy)) = found.sender or self._robot, found.position
-                places.append(LandmarkBelief(who, name, now_ns, x, y, (xx, xy, yy)))
+                x, y, (xx, xy, yy) = found.position
+                places.append(LandmarkBelief(self._robot, name, now_ns, x, y, (xx, xy, yy)))
         return [LandmarkPlaces(now_ns, tuple(places))]
 
     def _frame_estimates(self, now_ns: int) -> list[FrameEstimate]:

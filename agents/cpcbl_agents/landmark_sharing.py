@@ -7,7 +7,6 @@ so nothing is sent for long, and no robot's word comes back to it as a better on
 """
 
 import math
-from collections.abc import Mapping
 from typing import Final
 
 from cpcbl_team.inputs import LandmarkBelief, Sightings
@@ -35,7 +34,8 @@ class LandmarkSharing:
         self._robot, self._names = robot, names
         self._seen_ns: dict[str, int] = {}
         self._sent: dict[str, tuple[int, int]] = {}  # tier and time of the last word on each
-        self._places: Mapping[str, LandmarkBelief] = {}
+        self._own: dict[str, LandmarkBelief] = {}
+        self._known: dict[str, int] = {}  # the best tier in which each is known, by whomever
         self.asked_for: frozenset[str] = frozenset()
         """The landmarks whose places somebody asks for in the tiers in which this robot knows
         them."""
@@ -44,8 +44,7 @@ class LandmarkSharing:
     def tiers(self) -> dict[str, int]:
         """The landmarks whose places this robot knows of its own, and the tiers in which it tells
         them."""
-        own = (place for place in self._places.values() if place.robot == self._robot)
-        tiers = {place.landmark: landmark_tier(place) for place in own}
+        tiers = {name: landmark_tier(place) for name, place in self._own.items()}
         return {name: tier for name, tier in tiers.items() if tier < UNKNOWN_TIER}
 
     def see(self, frame: Sightings) -> None:
@@ -55,17 +54,21 @@ class LandmarkSharing:
                 self._seen_ns[sighting.id] = frame.stamp_ns
 
     def update(self, places: tuple[LandmarkBelief, ...]) -> None:
-        """The robot knows these places now."""
-        self._places = {place.landmark: place for place in places}
+        """The robot knows these places now: of its own, or from others."""
+        self._own = {place.landmark: place for place in places if place.robot == self._robot}
+        known: dict[str, int] = {}
+        for place in places:
+            tier = landmark_tier(place, ROUNDING)
+            known[place.landmark] = min(tier, known.get(place.landmark, UNKNOWN_TIER))
+        self._known = known
 
     def wanted(self, now_ns: int) -> frozenset[tuple[str, int]]:
         """The landmarks in sight, with the tiers in which the robot asks for their places."""
-        tiers = {name: landmark_tier(place, ROUNDING) for name, place in self._places.items()}
         return frozenset(
             (name, tier)
             for name, seen_ns in self._seen_ns.items()
             if now_ns - seen_ns <= IN_SIGHT_NS
-            for tier in range(tiers.get(name, UNKNOWN_TIER))
+            for tier in range(self._known.get(name, UNKNOWN_TIER))
         )
 
     def next_word(self, now_ns: int) -> tuple[LandmarkBelief, int] | None:
@@ -81,7 +84,7 @@ class LandmarkSharing:
         if not due:
             return None
         _, last_ns, name = min(due)
-        return self._places[name], last_ns
+        return self._own[name], last_ns
 
     def note_sent(self, told: LandmarkBelief) -> None:
         """This was sent."""
