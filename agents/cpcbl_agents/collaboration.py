@@ -128,7 +128,7 @@ class CollaborationAgent:
                 self.landmarks.update(message.places)
                 return self._landmark_words(now_ns)
             case agent.LandmarkSubscribers(names):
-                self.landmarks.asked_for = names
+                self.landmarks.ask(names, now_ns)
             case agent.Presence(name, tier):
                 self.guests.set_presence(name, tier is not None)
                 self._tiers.pop(name, None)

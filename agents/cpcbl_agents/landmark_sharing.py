@@ -3,10 +3,12 @@
 A landmark that is not on the team's map has a tier, by the sigma of its place. A robot asks for the
 place of a landmark that it sees in better tiers than that of its own knowledge, and tells what it
 has found or known itself while somebody asks. Whoever has taken a place asks for better ones alone,
-so nothing is sent for long, and no robot's word comes back to it as a better one.
+so nothing is sent for long, and no robot's word comes back to it as a better one. Of many robots
+that know a place each waits another time before it tells it, so that the first ones suffice.
 """
 
 import math
+import zlib
 from typing import Final
 
 from cpcbl_team.inputs import LandmarkBelief, Sightings
@@ -16,6 +18,7 @@ TIER_WIDTH: Final = 2.0  # ratio of the sigmas of two tiers
 UNKNOWN_TIER: Final = 8  # beyond 1.28 m a place is not told
 ROUNDING: Final = 1.01  # by which a sigma on the wire may be larger
 IN_SIGHT_NS: Final = 10_000_000_000  # a place is asked for so long after its landmark was seen
+SLOT_NS: Final = 50_000_000  # of waiting, a robot of the team
 REPEAT_NS: Final = 1_000_000_000  # between two words on a landmark of the same tier
 
 
@@ -29,16 +32,25 @@ def landmark_tier(place: LandmarkBelief, rounding: float = 1.0) -> int:
 class LandmarkSharing:
     """What one robot tells of landmarks, and what it asks for."""
 
-    def __init__(self, robot: str, names: frozenset[str]) -> None:
-        """`names`: of the landmarks that are not on the team's map."""
+    def __init__(self, robot: str, names: frozenset[str], robots: int = 1) -> None:
+        """`names`: of the landmarks that are not on the team's map. `robots`: of the team."""
         self._robot, self._names = robot, names
+        self._waits_ns = {name: _share(f"{name}/{robot}") * robots * SLOT_NS for name in names}
         self._seen_ns: dict[str, int] = {}
         self._sent: dict[str, tuple[int, int]] = {}  # tier and time of the last word on each
         self._own: dict[str, LandmarkBelief] = {}
         self._known: dict[str, int] = {}  # the best tier in which each is known, by whomever
-        self.asked_for: frozenset[str] = frozenset()
+        self._asked_ns: dict[str, int] = {}
+
+    @property
+    def asked_for(self) -> frozenset[str]:
         """The landmarks whose places somebody asks for in the tiers in which this robot knows
         them."""
+        return frozenset(self._asked_ns)
+
+    def ask(self, names: frozenset[str], now_ns: int) -> None:
+        """Somebody asks for the places of these landmarks now, and of no others."""
+        self._asked_ns = {name: self._asked_ns.get(name, now_ns) for name in names}
 
     @property
     def tiers(self) -> dict[str, int]:
@@ -79,7 +91,8 @@ class LandmarkSharing:
         for name, tier in self.tiers.items():
             last_tier, last_ns = self._sent.get(name, (UNKNOWN_TIER, 0))
             is_due = tier < last_tier or now_ns - last_ns >= REPEAT_NS
-            if is_due and name in self.asked_for:
+            asked_ns = self._asked_ns.get(name)
+            if is_due and asked_ns is not None and now_ns - asked_ns >= self._waits_ns[name]:
                 due.append((tier, last_ns, name))
         if not due:
             return None
@@ -89,3 +102,8 @@ class LandmarkSharing:
     def note_sent(self, told: LandmarkBelief) -> None:
         """This was sent."""
         self._sent[told.landmark] = landmark_tier(told), told.stamp_ns
+
+
+def _share(text: str) -> float:
+    """From 0 to 1: the same for the same text on every machine."""
+    return zlib.crc32(text.encode()) / 2**32

@@ -76,14 +76,23 @@ def test_a_robot_without_map_and_start_gets_the_map_from_one_that_has_it() -> No
 
 def test_each_place_is_told_once_and_then_nothing_is_asked_for() -> None:
     stand = TeamOnBus(team())
-    ear = stand.ear("landmark/**")
-    ear.close()
     look(stand, seconds=10.0)
     (flow,) = words(stand, "guide")
     assert flow.messages == len(PLACES)
     assert flow.bytes == flow.messages * sent_bytes(LANDMARK_BYTES)
     assert asked_for(stand, "me") == set()
     assert words(stand, "me") == []
+
+
+def test_of_many_robots_that_know_a_place_few_tell_it() -> None:
+    many = team()
+    knowing = {f"guide{k}": many.robots["guide"] for k in range(20)}
+    many = msgspec.structs.replace(many, robots={"me": many.robots["me"], **knowing})
+    stand = TeamOnBus(many)
+    look(stand, "me", seconds=10.0)
+    told = sum(flow.messages for name in knowing for flow in words(stand, name))
+    assert len(PLACES) <= told <= 4 * len(PLACES)
+    assert asked_for(stand, "me") == set()
 
 
 def test_nothing_is_told_about_landmarks_that_nobody_sees() -> None:
@@ -189,7 +198,7 @@ def test_tiers_of_places() -> None:
 def test_the_best_place_is_told_first_and_each_again_after_a_second() -> None:
     sharing = LandmarkSharing("me", frozenset(PLACES))
     sharing.update((place("oak", 0.1), place("elm", 0.02), place("ash", 0.01, "mate")))
-    sharing.asked_for = frozenset(PLACES)
+    sharing.ask(frozenset(PLACES), 0)
     told = []
     for k in range(1, 15):
         found = sharing.next_word(k * SECOND // 10)
@@ -202,7 +211,7 @@ def test_the_best_place_is_told_first_and_each_again_after_a_second() -> None:
 
 def test_a_place_of_a_better_tier_is_told_at_once() -> None:
     sharing = LandmarkSharing("me", frozenset(PLACES))
-    sharing.asked_for = frozenset(PLACES)
+    sharing.ask(frozenset(PLACES), 0)
     sharing.update((place("oak", 0.1),))
     first = sharing.next_word(SECOND)
     assert first is not None
