@@ -77,10 +77,9 @@ class Robot:
         budget = Budget(settings.collaboration.budget, start_ns, *match)
         names = team.map.names | frozenset(team.robots)
         guests = GuestRegistry(names, team.guests.most if team.guests.allowed else 0)
-        agent = name, settings, teammates, start_ns, budget, guests
-        self.collaboration = CollaborationAgent(
-            *agent, LandmarkSharing(name, shared, len(team.robots))
-        )
+        sharing = LandmarkSharing(name, shared, len(team.robots))
+        agent = name, settings, teammates, start_ns, budget, guests, sharing
+        self.collaboration = CollaborationAgent(*agent)
 
     def handle(self, message: Message | Tick | BusEvent, now_ns: int) -> list[Outgoing]:
         """Everything that this robot publishes because of one message (from the bus, or a tick).

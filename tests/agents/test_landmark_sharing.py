@@ -5,7 +5,9 @@ from typing import Any
 
 import msgspec
 import pytest
-from support.buses import SECOND, TeamOnBus, robot_at, saw, team_of
+from hypothesis import given
+from hypothesis import strategies as st
+from support.buses import SECOND, TeamOnBus, examples, robot_at, saw, team_of
 from support.wired_team import repeat_until, seen_between, wired
 
 from cpcbl_agents.landmark_sharing import UNKNOWN_TIER, LandmarkSharing, landmark_tier
@@ -21,10 +23,11 @@ from cpcbl_team.config import (
 from cpcbl_team.inputs import LandmarkBelief, Sighting, Sightings
 from cpcbl_transport import topics
 from cpcbl_transport.compact import LANDMARK_BYTES, sent_bytes
-from cpcbl_transport.messages import Flow
+from cpcbl_transport.messages import VERSION, Flow, Refusal
 
 PLACES = {"oak": (4.0, 1.0), "elm": (3.0, -2.0), "ash": (-2.0, 3.0)}
 KNOWN = {name: LandmarkPosition(x_m=x, y_m=y) for name, (x, y) in PLACES.items()}
+VERSIONED = bytes([VERSION]).__add__
 HERE = {"guide": (0.0, 0.0), "me": (1.0, 0.5)}
 
 
@@ -166,6 +169,34 @@ def test_a_word_on_what_is_no_landmark_of_the_team_is_counted() -> None:
     counts = stand.nodes["me"].counts + stand.robots["me"].counts
     assert counts["own_message"] == 1
     assert stand.robots["me"].filter.places == ()
+
+
+@examples(50)
+@given(
+    st.lists(
+        st.binary(max_size=40)
+        | st.binary(min_size=LANDMARK_BYTES - 1, max_size=LANDMARK_BYTES - 1).map(VERSIONED),
+        min_size=1,
+        max_size=20,
+    )
+)
+def test_any_bytes_about_a_landmark_are_used_or_counted(payloads: list[bytes]) -> None:
+    stand = TeamOnBus(team(me={}), here=["me"])
+    look(stand, "me")
+    node, robot = stand.nodes["me"], stand.robots["me"]
+    before = (node.counts + robot.counts).total()
+    for payload in payloads:
+        node.arrivals.put_message(
+            topics.LANDMARK.at(landmark="oak", tier=0, robot="guide"), payload
+        )
+        look(stand, "me", seconds=0.2)
+    told = sum(flow.messages for flow in node.received.flows() if flow.topic == "landmark")
+    refused = sum(node.counts[reason] for reason in Refusal)
+    assert told + refused == len(payloads)
+    assert (node.counts + robot.counts).total() > before
+    pose, covariance, _ = robot.filter.timeline.state.estimate
+    assert all(map(math.isfinite, (*pose, *covariance)))
+    assert math.dist(pose[:2], HERE["me"]) < 0.2
 
 
 def test_over_zenoh_the_map_arrives_and_the_link_is_silent_afterwards() -> None:

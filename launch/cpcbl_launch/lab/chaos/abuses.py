@@ -55,7 +55,8 @@ def flood(abuser: Abuser) -> int:
 def garbage(abuser: Abuser) -> int:
     """Sends payloads that are no messages on all keys on which a robot may publish."""
     robot, dice, sent = abuser.robot, random.Random(abuser.robot), 0
-    topics_of_it = (*topics.INPUTS, topics.BELIEF, topics.STATUS, topics.TRACK, topics.DRIVE)
+    of_it = topics.BELIEF, topics.LANDMARK, topics.STATUS, topics.TRACK, topics.DRIVE
+    topics_of_it = (*topics.INPUTS, *of_it)
     keys = [(t.at(robot=robot, tier=0), t.qos) for t in topics_of_it]
     fixes = (topics.FIX.at(robot=name, tier=0, observer=robot) for name in abuser.targets)
     keys += [(key, topics.FIX.qos) for key in fixes]
