@@ -213,6 +213,9 @@ class CommonErrorFilter:
         intersection of all that it estimates; unchanged where that makes the pose no better."""
         common, prior = state.common_errors, state.estimate
         assert common is not None
+        place = common.place_covariance(told.landmark)
+        if covariance.xx + covariance.yy >= place.xx + place.yy:
+            return state
         x, y = common.place_error(told.landmark)
         number, residuals = common.objects[told.landmark], (told.x_m - x, told.y_m - y)
         word = Observation((ZERO_ROW, ZERO_ROW), residuals, EXACT, covariance)

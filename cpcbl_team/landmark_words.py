@@ -1,7 +1,7 @@
 """What teammates say of landmarks whose places are not on the map, as one robot uses it.
 
-A word is merged once, as it comes, into the place that the robot has found itself. Of a landmark of
-which it has no place the word is kept, and the landmark is then like a teammate that stands there:
+A word is merged, as it comes and while it is better, into the place that the robot has found
+itself; by covariance intersection, to which repetition tells nothing new. Of a landmark of which it has no place the word is kept, and the landmark is then like a teammate that stands there:
 as long as the word is much better than what the robot would find, or the robot is lost. In between
 it finds the place itself, for its own place is known better in relation to its own pose.
 """
@@ -17,6 +17,7 @@ from cpcbl_team.state import State, with_landmark
 from cpcbl_team.teammates import TeammateScreen
 
 MUCH_BETTER = 0.25  # of the variance of the robot's own position
+AGAIN_NS = 1_000_000_000  # in the first frame of each such time
 
 
 class LandmarkWords:
@@ -48,8 +49,7 @@ class LandmarkWords:
         still."""
         if told.landmark not in self._unsurveyed or not self._passive:
             return state
-        state = with_landmark(state, told)
-        common = self._common
+        state, common = with_landmark(state, told), self._common
         if common is None or state.lost or not common.has_found(state, told.landmark):
             return state
         covariance = self._screen.cautious(state, told.robot, Covariance2(*told.covariance))
@@ -59,4 +59,19 @@ class LandmarkWords:
             return state
         if nis > self._gate:
             return state.counted("landmark_gated")
+        return common.with_word(state, told, covariance)
+
+    def seen(self, state: State, name: str) -> State:
+        """The state when it sees this landmark: after the word on it once more, now and then."""
+        told = state.memory.teammates.landmarks.get(name)
+        if told is None or state.stamp_ns // AGAIN_NS == state.updates.accepted_ns // AGAIN_NS:
+            return state
+        common = self._common
+        if common is None or state.lost or not common.has_found(state, name):
+            return state
+        if name not in state.memory.teammates.trusted_landmarks:
+            return state
+        covariance = self._screen.cautious(state, told.robot, Covariance2(*told.covariance))
+        if common.word_nis(state, told, covariance) > self._gate:
+            return state
         return common.with_word(state, told, covariance)

@@ -212,7 +212,7 @@ class Localizer:
                 faults.append(fault)
                 continue
             if self._common is not None:
-                state = self._common.with_object(state, sighting.id)
+                state = self.words.seen(self._common.with_object(state, sighting.id), sighting.id)
                 sighting = self._common.corrected(state, sighting)
                 if sighting.id not in told and self._common.has_no_place(state, sighting.id):
                     state = self._common.with_reading(state, sighting, now_ns)
