@@ -1,9 +1,10 @@
 """What teammates say of landmarks whose places are not on the map, as one robot uses it.
 
 A word is merged, as it comes and while it is better, into the place that the robot has found
-itself; by covariance intersection, to which repetition tells nothing new. Of a landmark of which it has no place the word is kept, and the landmark is then like a teammate that stands there:
-as long as the word is much better than what the robot would find, or the robot is lost. In between
-it finds the place itself, for its own place is known better in relation to its own pose.
+itself: by covariance intersection, to which repetition tells nothing new. Of a landmark of which it
+has no place the word is kept, and the landmark is then like a teammate that stands there: as long
+as the word is much better than what the robot would find, or the robot is lost. In between it finds
+the place itself, for its own place is known better in relation to its own pose.
 """
 
 from collections.abc import Mapping
