@@ -102,6 +102,19 @@ def test_a_better_word_improves_the_place_and_the_pose() -> None:
     assert after.estimate.shared == after.estimate.covariance
 
 
+def test_a_word_that_came_while_it_was_of_no_use_is_merged_when_the_landmark_is_seen() -> None:
+    one, before = found()
+    state = before
+    for name in CORNERS.landmarks:
+        state = with_landmark(state, word(name, state.stamp_ns))  # as while it was lost
+    with_words, without = (round_trip(one, s).common_errors for s in (state, before))
+    assert with_words is not None
+    assert without is not None
+    for name in CORNERS.landmarks:
+        new, old = with_words.place_covariance(name), without.place_covariance(name)
+        assert new.xx + new.yy < 0.5 * (old.xx + old.yy)
+
+
 def test_a_word_that_comes_again_and_again_makes_nothing_certain() -> None:
     """Once it has come, its repetition tells nothing: below the word's own sigma nothing gets."""
     one, state = found()
@@ -113,19 +126,22 @@ def test_a_word_that_comes_again_and_again_makes_nothing_certain() -> None:
     assert np.linalg.eigvalsh(matrix2(place))[0] > 0.05**2
 
 
-def test_no_pose_is_overconfident_for_its_own_words_that_come_back() -> None:
-    """The worst case: a teammate repeats what this robot once said, as if it were new."""
+def test_words_that_came_from_this_robot_make_no_pose_overconfident() -> None:
+    """A teammate has improved what this robot once said: seven tenths of its error are still in it.
+    Three times it says so; taken as new each time, it would give a NEES of 4.4."""
     errors = []
-    for seed in range(60):
+    for seed in range(16):
         rng = np.random.default_rng(seed)
         one, state = found(replace(EXACT_START, x_m=LOOP_START.x + 0.1 * rng.normal()))
         state = one.mark_shared(state, BeliefShared(state.stamp_ns))
-        for name in CORNERS.landmarks:
+        for name, mark in CORNERS.landmarks.items():
             assert state.common_errors is not None
-            covariance = state.common_errors.place_covariance(name)
-            said = LandmarkBelief("mate", name, state.stamp_ns, 0.0, 0.0, tuple(covariance))  # type: ignore[arg-type]
             x, y = state.common_errors.place_error(name)
-            state = one.words.add(state, replace(said, x_m=x, y_m=y))
+            xx, xy, yy = state.common_errors.place_covariance(name).scaled(0.5)
+            told = LandmarkBelief("mate", name, state.stamp_ns, 0.0, 0.0, (xx, xy, yy))
+            x, y = mark.x_m + 0.7 * (x - mark.x_m), mark.y_m + 0.7 * (y - mark.y_m)
+            for _ in range(3):
+                state = one.words.add(state, replace(told, x_m=x, y_m=y))
         pose, c = state.estimate.pose, state.estimate.covariance
         off = np.array([pose.x - LOOP_START.x, pose.y - LOOP_START.y])
         errors.append(off @ np.linalg.inv(matrix2(c.position())) @ off)
