@@ -7,7 +7,7 @@ import msgspec
 import pytest
 from support.buses import SECOND, TeamOnBus, robot_at, saw, team_of
 
-from cpcbl_agents import clocks, collaboration
+from cpcbl_agents import clocks, message_counters
 from cpcbl_agents.input_diagnosis import monitor
 from cpcbl_team import state, teammates
 from cpcbl_team.config import GuestSettings
@@ -34,7 +34,7 @@ def names_in(root: object) -> set[str]:
 def test_names_of_guests_that_left_are_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
     for module, limit in (
         (clocks, "MOST_SENDERS"),
-        (collaboration, "MOST_PEERS"),
+        (message_counters, "MOST_PEERS"),
         (teammates, "MOST_SENDERS"),
         (state, "MOST_OBJECTS"),
         (monitor, "STEPS"),  # so many frames are kept, too

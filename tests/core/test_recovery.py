@@ -181,7 +181,7 @@ def test_evidence_is_as_uncertain_as_the_teammate_that_gave_it() -> None:
     """Of a place the mean variance of both axes: that of a belief, or the observer's part."""
     state = state_at(ORIGIN, diagonal(0.1, 0.1), stamp_ns=SECOND)
     place = ObjectPosition(4.5, 2.5, Covariance2(0.01, 0.0, 0.07))
-    visible = Measurement("mate", place, None, True, 5.0, 0.5, 0.1, 0.1)
+    visible = Measurement("mate", place, None, True, 5.0, 0.5, 0.1, 0.1, sender="mate")
     by_belief = evidence_from_measurement(state, visible)
     assert by_belief.teammate_sigma_m == pytest.approx(0.2)
     assert by_belief.from_teammate

@@ -103,7 +103,7 @@ def test_residuals_follow_the_error_of_a_place(name: str, pose: Pose2) -> None:
     derivatives = [(residuals(STEP * e) - residuals(-STEP * e)) / (2 * STEP) for e in np.eye(2)]
     common = common_of(np.eye(7))._replace(objects={name: 2})
     seen = frame(pose, 0, field, [name]).sightings[0]
-    m = measurement_of(seen, 0, pose, field, {}, SETTINGS)
+    m = measurement_of(seen, 0, pose, field, {}, SETTINGS, common)
     assert m is not None
     found = sensitivities_of(m, constraints_of(pose, m, POSE, JOINT), common)
     of_object = [[dict(sensitivity)[i] for sensitivity in found] for i in (2, 3)]

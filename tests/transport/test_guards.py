@@ -50,6 +50,7 @@ def test_every_target_and_beliefs_have_a_rate_and_every_key_a_size() -> None:
         "cpcbl/tests/fix/healthy/*/*": 30.0,
         "cpcbl/tests/fix/faulty/*/*": 30.0,
         "cpcbl/tests/belief/*/*": 20.0,
+        "cpcbl/tests/landmark/*/*/*": 20.0,
         "cpcbl/tests/in/victim/frame": 60.0,
         "cpcbl/tests/in/healthy/frame": 60.0,
         "cpcbl/tests/in/faulty/frame": 60.0,
@@ -57,6 +58,7 @@ def test_every_target_and_beliefs_have_a_rate_and_every_key_a_size() -> None:
     assert limits(rules) == {
         "cpcbl/tests/fix/*/*/*": 99,
         "cpcbl/tests/belief/*/*": 99,
+        "cpcbl/tests/landmark/*/*/*": 99,
         "cpcbl/tests/status/*": 999,
         "cpcbl/tests/track/*": 999,
         "cpcbl/tests/pose/*": 999,

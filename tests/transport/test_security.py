@@ -212,7 +212,15 @@ def test_operators_and_routers_publish_nothing_of_their_own() -> None:
 def test_permitted_subscriptions_follow_the_table_too() -> None:
     me = Identity(Role.ROBOT, "me")
     assert set(subscribe_keys(me)) == {
-        *("alive/*/*/*", "belief/*/*", "fix/me/*/*", "status/me", "track/me", "look/me"),
+        *(
+            "alive/*/*/*",
+            "belief/*/*",
+            "fix/me/*/*",
+            "landmark/*/*/*",
+            "status/me",
+            "track/me",
+            "look/me",
+        ),
         *("pose/*", "pose/*/json", "status/me/json"),
         *(f"in/me/{name}" for name in ("odometry", "sightings", "position", "frame")),
         "in/me/initial_pose",
