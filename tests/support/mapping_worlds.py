@@ -72,6 +72,7 @@ def make_world(
     places: dict[str, tuple[float, float]] | None = None,
     change: Change = lambda robot, at_s, sighting: sighting,
     walls: dict[str, Ends] | None = None,
+    odometry: OdometrySettings = ODOMETRY,
 ) -> World:
     """Robots that drive from one random point of the field to the next, and see all around. `noise`
     is a multiple of what the settings state; `blind` robots see teammates alone. The team file says
@@ -80,7 +81,7 @@ def make_world(
     rng, names = np.random.default_rng(seed), [f"r{i + 1}" for i in range(robots)]
     start = Start(x_m=1.0, y_m=1.0, heading_deg=20.0, sigma_m=0.0, heading_sigma_deg=0.0)
     settings = {
-        name: RobotSettings(source="external", odometry=ODOMETRY, sensor=SENSOR, start=start)
+        name: RobotSettings(source="external", odometry=odometry, sensor=SENSOR, start=start)
         for name in names
     }
     marks = {name: Landmark(x_m=x, y_m=y) for name, (x, y) in places.items()}
@@ -90,7 +91,8 @@ def make_world(
     for day in range(days):
         path = {name: _path(rng, i, seconds) for i, name in enumerate(names)}
         run = f"day{day + 1}"
-        runs.append(_run(rng, run, path, places, walls, noise, set(blind), range_m, change))
+        inputs = _run(rng, run, path, places, walls, noise, set(blind), range_m, change, odometry)
+        runs.append(inputs)
         paths.append(path)
     return World(team, runs, places, paths, walls)
 
@@ -119,10 +121,11 @@ def _run(
     blind: set[str],
     range_m: float,
     change: Change,
+    settings: OdometrySettings,
 ) -> RunInputs:
     odometry, frames = dict[str, list[Odometry]](), dict[str, list[Sightings]]()
     for robot, path in paths.items():
-        odometry[robot] = _odometry(rng, path, noise)
+        odometry[robot] = _odometry(rng, path, noise, settings)
         frames[robot] = []
         for i in range(0, len(path), STEPS_PER_FRAME):
             seen: dict[str, tuple[float, float]] = {} if robot in blind else dict(places)
@@ -149,13 +152,15 @@ def _feet(pose: Floats, walls: dict[str, Ends]) -> dict[str, tuple[float, float]
     return feet
 
 
-def _odometry(rng: np.random.Generator, path: Floats, noise: float) -> list[Odometry]:
+def _odometry(
+    rng: np.random.Generator, path: Floats, noise: float, settings: OdometrySettings
+) -> list[Odometry]:
     pieces = []
     for i, (before, after) in enumerate(pairwise(path)):
         turn = wrap_angle(after[2] - before[2])
         distance = math.hypot(*(after - before)[:2])
-        along = math.sqrt(distance_variance(distance, turn, ODOMETRY, 0.0))
-        around = math.sqrt(turn_variance(distance, turn, ODOMETRY))
+        along = math.sqrt(distance_variance(distance, turn, settings, 0.0))
+        around = math.sqrt(turn_variance(distance, turn, settings))
         e = noise * rng.standard_normal(2)
         read = float(distance + e[0] * along), float(turn + e[1] * around)
         pieces.append(Odometry(i * STEP_NS, (i + 1) * STEP_NS, *read))

@@ -222,18 +222,15 @@ class WallViews(NamedTuple):
 
 
 def wall_views(problem: Problem, x: Floats) -> WallViews:
-    """A bearing tells the side; without one it is that of the pose."""
+    """Their poses tell the side."""
     readings = problem.readings
     mine = readings.wall >= 0
-    wall, drive = readings.wall[mine], readings.drive[mine]
-    poses, _, constants = problem.parts(x)
-    own, (offset, direction) = poses[readings.pose[mine]], problem.lines(x)[wall].T
+    wall = readings.wall[mine]
+    own, (offset, direction) = problem.parts(x)[0][readings.pose[mine]], problem.lines(x)[wall].T
     dx, dy = (own[:, :2] - problem.pivots[wall]).T
     c, s = np.cos(direction), np.sin(direction)
     distance = c * dy - s * dx - offset
-    towards = own[:, 2] + readings.bearing[mine] - constants[drive, BEARING]
-    from_left = np.where(np.isnan(towards), distance, np.sin(direction - towards)) >= 0.0
-    return WallViews(distance, np.where(from_left, 1.0, -1.0), c * dx + s * dy)
+    return WallViews(distance, np.where(distance >= 0.0, 1.0, -1.0), c * dx + s * dy)
 
 
 def _of_walls(problem: Problem, x: Floats) -> tuple[Floats, Floats]:

@@ -12,6 +12,7 @@ from support.mapping_worlds import MARKS, ROOM, Change, World, make_world
 from cpcbl_launch.mapping.first_estimate import Request
 from cpcbl_launch.mapping.mapped_walls import mapped_wall
 from cpcbl_launch.mapping.mapper import Mapped, build_map
+from cpcbl_team.config import OdometrySettings
 from cpcbl_team.inputs import Sighting
 
 EXACT = 1e-5
@@ -113,6 +114,22 @@ def test_a_room_without_landmarks_in_its_own_frame() -> None:
     )
     distance = np.linalg.det(np.array([south.ends[1] - south.ends[0], -south.ends[0]]))
     assert math.isclose(abs(distance) / south.length_m, 1.7, abs_tol=1e-5)
+
+
+def test_a_long_drive_with_poor_odometry_that_sees_walls_alone() -> None:
+    """By odometry alone the path would be turned by half and more at its end."""
+    poor = OdometrySettings(
+        distance_sigma_m_per_sqrt_m=0.1,
+        turn_sigma_rad_per_sqrt_rad=0.1,
+        turn_sigma_rad_per_sqrt_m=0.15,
+    )
+    world = make_world(2, seconds=400.0, walls=ROOM, places={}, odometry=poor)
+    exact = {name: exact_walls(ROOM)[name] for name in ("south", "east")}
+    mapped = mapped_world(world, Request({}, walls=exact))
+    (drive,) = mapped.drives
+    truth = world.paths[0]["r1"][np.array(drive.stamps_ns) // 100_000_000]
+    found = mapped.problem.parts(mapped.solution.x)[0]
+    assert np.abs(found[:, :2] - truth[:, :2]).max() < 0.3
 
 
 # With noise ---------------------------------------------------------------------------------------
