@@ -27,6 +27,7 @@ from cpcbl_team.config.field import Light as Light
 from cpcbl_team.config.field import SimulationEvent as SimulationEvent
 from cpcbl_team.config.field import SimulationSettings as SimulationSettings
 from cpcbl_team.config.field import Unsurveyed as Unsurveyed
+from cpcbl_team.config.field import UnsurveyedWall as UnsurveyedWall
 from cpcbl_team.config.field import Wall as Wall
 from cpcbl_team.config.localizer import LocalizerSettings as LocalizerSettings
 from cpcbl_team.config.localizer import Variant as Variant

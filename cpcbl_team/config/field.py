@@ -21,6 +21,8 @@ class LandmarkPosition(Table, frozen=True, kw_only=True):
     """Standard deviation of its place along each axis of the field (m); 0: it is known exactly."""
     covariance_m2: tuple[float, float, float] | None = None
     """In place of `sigma_m`: the covariance (xx, xy, yy) of its place in the field's frame."""
+    mapped_from: tuple[str, ...] = ()
+    """The runs from which `calibrate map` estimated the place: they do not count twice."""
 
     @property
     def is_exact(self) -> bool:
@@ -57,6 +59,8 @@ class Wall(Table, frozen=True, kw_only=True):
     """Standard deviation of its middle along its normal (m)."""
     direction_sigma_deg: NotNegative = 0.0
     """Standard deviation of its direction."""
+    mapped_from: tuple[str, ...] = ()
+    """As of a landmark."""
 
     @property
     def is_exact(self) -> bool:
@@ -68,22 +72,38 @@ class Wall(Table, frozen=True, kw_only=True):
         return math.atan2(self.to_m[1] - self.from_m[1], self.to_m[0] - self.from_m[0])
 
 
+class UnsurveyedWall(Table, frozen=True, kw_only=True):
+    """A wall whose place nobody knows beforehand. Robots do not find it while they drive; it is
+    found from their runs."""
+
+    gives: Gives = "both"
+    true_from_m: tuple[float, float] | None = None
+    """Where it begins on the simulated field, in the field's frame. No robot knows it."""
+    true_to_m: tuple[float, float] | None = None
+
+
 class Field(Table, frozen=True, kw_only=True):
     """The map: all landmarks and walls by their names."""
 
     landmarks: dict[str, Landmark] = msgspec.field(default_factory=dict)
     walls: dict[str, Wall] = msgspec.field(default_factory=dict)
     unsurveyed: dict[str, Unsurveyed] = msgspec.field(default_factory=dict)
+    unsurveyed_walls: dict[str, UnsurveyedWall] = msgspec.field(default_factory=dict)
 
     @property
     def names(self) -> frozenset[str]:
         """The names of all that robots may see, but for robots."""
-        return frozenset((*self.landmarks, *self.walls, *self.unsurveyed))
+        return frozenset((*self.landmarks, *self.unsurveyed, *self.all_walls))
 
     @property
     def all_landmarks(self) -> dict[str, Landmark | Unsurveyed]:
         """All landmarks, those that nobody has surveyed too."""
         return {**self.landmarks, **self.unsurveyed}
+
+    @property
+    def all_walls(self) -> dict[str, Wall | UnsurveyedWall]:
+        """All walls, those that nobody has surveyed too."""
+        return {**self.walls, **self.unsurveyed_walls}
 
     @property
     def gives_only_ranges(self) -> bool:

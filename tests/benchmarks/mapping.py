@@ -73,10 +73,10 @@ def gtsam_places(problem: Problem, x: Floats) -> Floats:
     for row in zip(*problem.readings, strict=True):
         _add_reading(gtsam, graph, mark, row)
     priors = problem.priors
-    column, first = priors.column - problem.landmark_column(), 2 * problem.landmarks
+    column, first = priors.columns[:, 0] - problem.landmark_column(), 2 * problem.landmarks
     known = np.flatnonzero((column >= 0) & (column < first))[::2]
     for i in known:
-        at, sigma = priors.value[i : i + 2], priors.sigma[i]
+        at, sigma = priors.values[i], 1.0 / priors.factors[i, 0]
         noise = gtsam.noiseModel.Isotropic.Sigma(2, sigma)
         graph.add(gtsam.PriorFactorPoint2(mark(int(column[i]) // 2), at, noise))
     found = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
@@ -84,7 +84,7 @@ def gtsam_places(problem: Problem, x: Floats) -> Floats:
 
 
 def _add_reading(gtsam: Any, graph: Any, mark: Any, row: tuple[Any, ...]) -> None:
-    pose, landmark, mate, _, range_m, bearing, *sigmas, of_range, of_bearing, _ = row
+    pose, landmark, _, mate, _, range_m, bearing, *sigmas, of_range, of_bearing, _ = row
     if not np.isfinite([range_m, bearing]).all():
         return
     each = np.array([sigmas[1] * np.sqrt(of_bearing), sigmas[0] * np.sqrt(of_range)])

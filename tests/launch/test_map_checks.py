@@ -5,6 +5,7 @@ from typing import Any
 import pytest
 from msgspec.structs import replace
 
+from cpcbl_launch.simulation.true_map import true_map
 from cpcbl_launch.team.checks import problems, warnings
 from cpcbl_team.config import (
     Field,
@@ -14,6 +15,7 @@ from cpcbl_team.config import (
     Start,
     Team,
     Unsurveyed,
+    UnsurveyedWall,
     Wall,
 )
 
@@ -34,6 +36,11 @@ def team_of(robot: RobotSettings = ROBOT, **objects: Any) -> Team:
     [
         ({"unsurveyed": {"sw": Unsurveyed()}}, "map: 'sw' names two things", "rename one of them"),
         ({"unsurveyed": {"r1": Unsurveyed()}}, "map: 'r1' names two things", "rename one of them"),
+        (
+            {"unsurveyed_walls": {"sw": UnsurveyedWall()}},
+            "map: 'sw' names two things",
+            "rename one of them",
+        ),
         (
             {"landmarks": {"sw": Landmark(x_m=0.0, y_m=0.0, covariance_m2=(1.0, 2.0, 1.0))}},
             "map.landmarks.sw.covariance_m2: [1, 2, 1] is no covariance",
@@ -70,6 +77,14 @@ def test_the_simulated_field_must_know_where_everything_stands() -> None:
     known = team_of(simulated, unsurveyed={"box": Unsurveyed(true_m=(1.0, 2.0))})
     assert list(problems(known)) == []
     assert list(problems(team_of(unsurveyed={"box": Unsurveyed()}))) == []
+    hidden = {"w": UnsurveyedWall()}
+    (line,) = problems(team_of(simulated, unsurveyed_walls=hidden))
+    assert line.startswith("map.unsurveyed_walls.w: the simulated field needs true_from_m")
+    assert list(problems(team_of(unsurveyed_walls=hidden))) == []
+    there = {"w": UnsurveyedWall(true_from_m=(0.0, 0.0), true_to_m=(6.0, 0.0))}
+    team = team_of(simulated, unsurveyed_walls=there)
+    assert list(problems(team)) == []
+    assert true_map(team, 1).walls == {"w": Wall(from_m=(0.0, 0.0), to_m=(6.0, 0.0))}
 
 
 def test_only_joint_finds_landmarks() -> None:

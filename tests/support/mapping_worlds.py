@@ -17,6 +17,7 @@ from cpcbl_team.config import (
     SensorSettings,
     Start,
     Team,
+    UnsurveyedWall,
 )
 from cpcbl_team.geometry import Pose2, step, wrap_angle
 from cpcbl_team.inputs import Odometry, Sighting, Sightings
@@ -33,6 +34,13 @@ MARKS = {
     "pole": (4.4, 2.6),
     "sofa": (6.3, 6.1),
 }
+ROOM = {  # around all of them
+    "south": ((-0.8, -0.7), (9.8, -0.7)),
+    "east": ((9.8, -0.7), (9.8, 6.9)),
+    "north": ((9.8, 6.9), (-0.8, 6.9)),
+    "west": ((-0.8, 6.9), (-0.8, -0.7)),
+}
+Ends = tuple[tuple[float, float], tuple[float, float]]
 ODOMETRY = OdometrySettings(
     distance_sigma_m_per_sqrt_m=0.03,
     turn_sigma_rad_per_sqrt_rad=0.03,
@@ -50,6 +58,7 @@ class World(NamedTuple):
     runs: list[RunInputs]
     places: dict[str, tuple[float, float]]
     paths: list[dict[str, Floats]]  # of each run and robot: true poses (n, 3), one each step
+    walls: dict[str, Ends]  # where they are, which no robot is told
 
 
 def make_world(
@@ -62,24 +71,30 @@ def make_world(
     range_m: float = 7.0,
     places: dict[str, tuple[float, float]] | None = None,
     change: Change = lambda robot, at_s, sighting: sighting,
+    walls: dict[str, Ends] | None = None,
+    odometry: OdometrySettings = ODOMETRY,
 ) -> World:
     """Robots that drive from one random point of the field to the next, and see all around. `noise`
-    is a multiple of what the settings state; `blind` robots see teammates alone."""
-    places = MARKS if places is None else places
+    is a multiple of what the settings state; `blind` robots see teammates alone. The team file says
+    that nobody has surveyed the walls."""
+    places, walls = MARKS if places is None else places, walls or {}
     rng, names = np.random.default_rng(seed), [f"r{i + 1}" for i in range(robots)]
     start = Start(x_m=1.0, y_m=1.0, heading_deg=20.0, sigma_m=0.0, heading_sigma_deg=0.0)
     settings = {
-        name: RobotSettings(source="external", odometry=ODOMETRY, sensor=SENSOR, start=start)
+        name: RobotSettings(source="external", odometry=odometry, sensor=SENSOR, start=start)
         for name in names
     }
     marks = {name: Landmark(x_m=x, y_m=y) for name, (x, y) in places.items()}
-    team = Team(name="mapping", robots=settings, map=Field(landmarks=marks))
+    field = Field(landmarks=marks, unsurveyed_walls={name: UnsurveyedWall() for name in walls})
+    team = Team(name="mapping", robots=settings, map=field)
     runs, paths = [], []
     for day in range(days):
         path = {name: _path(rng, i, seconds) for i, name in enumerate(names)}
-        runs.append(_run(rng, f"day{day + 1}", path, places, noise, set(blind), range_m, change))
+        run = f"day{day + 1}"
+        inputs = _run(rng, run, path, places, walls, noise, set(blind), range_m, change, odometry)
+        runs.append(inputs)
         paths.append(path)
-    return World(team, runs, places, paths)
+    return World(team, runs, places, paths, walls)
 
 
 def _path(rng: np.random.Generator, number: int, seconds: float) -> Floats:
@@ -101,18 +116,21 @@ def _run(
     name: str,
     paths: dict[str, Floats],
     places: dict[str, tuple[float, float]],
+    walls: dict[str, Ends],
     noise: float,
     blind: set[str],
     range_m: float,
     change: Change,
+    settings: OdometrySettings,
 ) -> RunInputs:
     odometry, frames = dict[str, list[Odometry]](), dict[str, list[Sightings]]()
     for robot, path in paths.items():
-        odometry[robot] = _odometry(rng, path, noise)
+        odometry[robot] = _odometry(rng, path, noise, settings)
         frames[robot] = []
         for i in range(0, len(path), STEPS_PER_FRAME):
             seen: dict[str, tuple[float, float]] = {} if robot in blind else dict(places)
             seen |= {n: (p[i, 0], p[i, 1]) for n, p in paths.items() if n != robot}
+            seen |= {} if robot in blind else _feet(path[i], walls)
             read = [_sighting(rng, path[i], n, at, noise) for n, at in seen.items()]
             near = [s for s in read if s.range_m is not None and s.range_m < range_m]
             changed = [change(robot, i * STEP_NS * 1e-9, s) for s in near]
@@ -122,15 +140,29 @@ def _run(
     return RunInputs(name, odometry, frames)
 
 
-def _odometry(rng: np.random.Generator, path: Floats, noise: float) -> list[Odometry]:
+def _feet(pose: Floats, walls: dict[str, Ends]) -> dict[str, tuple[float, float]]:
+    """Where the perpendiculars from a pose meet the walls."""
+    feet = {}
+    for name, (begin, end) in walls.items():
+        along = np.subtract(end, begin)
+        share = float((pose[:2] - begin) @ along / (along @ along))
+        if 0.0 <= share <= 1.0:
+            x, y = np.add(begin, share * along).tolist()
+            feet[name] = x, y
+    return feet
+
+
+def _odometry(
+    rng: np.random.Generator, path: Floats, noise: float, settings: OdometrySettings
+) -> list[Odometry]:
     pieces = []
     for i, (before, after) in enumerate(pairwise(path)):
         turn = wrap_angle(after[2] - before[2])
         distance = math.hypot(*(after - before)[:2])
-        along = math.sqrt(distance_variance(distance, turn, ODOMETRY, 0.0))
-        around = math.sqrt(turn_variance(distance, turn, ODOMETRY))
+        along = math.sqrt(distance_variance(distance, turn, settings, 0.0))
+        around = math.sqrt(turn_variance(distance, turn, settings))
         e = noise * rng.standard_normal(2)
-        read = distance + float(e[0]) * along, turn + float(e[1]) * around
+        read = float(distance + e[0] * along), float(turn + e[1] * around)
         pieces.append(Odometry(i * STEP_NS, (i + 1) * STEP_NS, *read))
     return pieces
 
@@ -140,6 +172,6 @@ def _sighting(
 ) -> Sighting:
     dx, dy = at[0] - pose[0], at[1] - pose[1]
     r, e = math.hypot(dx, dy), noise * rng.standard_normal(2)
-    bearing = math.atan2(dy, dx) - pose[2] + e[1] * SENSOR.bearing_sigma_rad
+    bearing = float(math.atan2(dy, dx) - pose[2] + e[1] * SENSOR.bearing_sigma_rad)
     range_m = max(r + float(e[0]) * range_sigma_m(SENSOR, r), 0.01)
-    return Sighting(name, float(range_m), wrap_angle(float(bearing)))
+    return Sighting(name, float(range_m), wrap_angle(bearing))

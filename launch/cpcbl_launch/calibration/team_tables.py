@@ -28,6 +28,7 @@ CAMERA_SIGMAS = (
     "yaw_sigma_deg",
     "focal_share",
 )
+UNSURVEYED = {"landmarks": "unsurveyed", "walls": "unsurveyed_walls"}
 MAX_SIGMA_ERROR = 0.1  # stated sigmas that differ from the errors by less stay
 MINIMUM = {  # a filter without any noise would trust a measurement without bounds
     "odometry.delay_s": 0.0,
@@ -95,8 +96,8 @@ def team_source(path: Path, output: Path | None) -> tuple[str, Path]:
 
 def edit_team(text: str, name: str, tables: Tables) -> str:
     """The text of a team file with these values in these tables. Raises TeamFileError. `name` is
-    the file's name in errors. A robot or type must exist; other tables are added. A landmark that
-    has a place now is no longer one that nobody has surveyed."""
+    the file's name in errors. A robot or type must exist; other tables are added. A landmark
+    or wall that has a place now is no longer one that nobody has surveyed."""
     try:
         document = tomlkit.parse(text)
     except tomlkit.exceptions.TOMLKitError as error:
@@ -116,7 +117,7 @@ def edit_team(text: str, name: str, tables: Tables) -> str:
                 table[part] = tomlkit.inline_table() if isinstance(table, InlineTable) else empty
             table = table[part]
         fresh = isinstance(table, Table) and not len(table)
-        for key, value in {**_taken_over(document, table_path), **values}.items():
+        for key, value in {**_taken_over(document, table_path, values), **values}.items():
             table[key] = _item(value, table)
         if fresh:
             table.add(tomlkit.nl())
@@ -125,17 +126,21 @@ def edit_team(text: str, name: str, tables: Tables) -> str:
     return changed
 
 
-def _taken_over(document: Any, table_path: TablePath) -> dict[str, TomlValue]:
-    """What a landmark keeps of its entry among those that nobody has surveyed, which is taken
-    out; and its former covariance is void."""
+def _taken_over(
+    document: Any, table_path: TablePath, values: Mapping[str, TomlValue]
+) -> dict[str, TomlValue]:
+    """What a landmark or wall keeps of its entry among those that nobody has surveyed, which is
+    taken out; and a former covariance, or sigma, that is not among its new values is void."""
     *table, name = table_path.names
-    if table != ["map", "landmarks"]:
+    if table not in (["map", "landmarks"], ["map", "walls"]):
         return {}
-    document["map"]["landmarks"][name].pop("covariance_m2", None)
-    unsurveyed = document["map"].get("unsurveyed", {})
+    for key in {"sigma_m", "covariance_m2"} - values.keys():
+        document["map"][table[1]][name].pop(key, None)
+    others = UNSURVEYED[table[1]]
+    unsurveyed = document["map"].get(others, {})
     former = unsurveyed.pop(name, {})
     if not unsurveyed:
-        document["map"].pop("unsurveyed", None)
+        document["map"].pop(others, None)
     return {key: TomlValue(former[key]) for key in ("gives", "colours") if key in former}
 
 

@@ -109,11 +109,13 @@ MapRuns = Annotated[
 Known = Annotated[
     str,
     Option(
-        help="Landmarks whose places in TEAM (or the log) fix the frame, e.g. 6,20, or none."
-        " Default: all without sigma_m."
+        help="Landmarks and walls whose places in TEAM (or the log) are used, with their sigmas,"
+        " e.g. 6,20, or none. Default: all."
     ),
 ]
-Withhold = Annotated[str, Option(help="Landmarks that are estimated although they are known.")]
+Withhold = Annotated[
+    str, Option(help="Landmarks and walls that are estimated as if they were not known.")
+]
 StartOf = Annotated[
     str, Option("--start", help="Robot whose start in TEAM fixes the frame, without known places.")
 ]
@@ -267,7 +269,7 @@ def landmark_map(
     export: PathFolder = None,
     as_json: AsJson = False,
 ) -> None:
-    """Places of landmarks, and the robots' paths, from runs of one or more robots and days."""
+    """Places of landmarks and walls, and paths, from runs of one or more robots and days."""
     require_scipy("calibrate map")
     from cpcbl_launch.mapping.command import map_runs
     from cpcbl_launch.mapping.report import map_report, map_tables, print_map

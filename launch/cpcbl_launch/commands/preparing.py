@@ -33,6 +33,8 @@ def check(file: options.Team) -> None:
     objects = [plural(len(field.landmarks), "landmark"), plural(len(field.walls), "wall")]
     if field.unsurveyed:
         objects.insert(1, f"{len(field.unsurveyed)} to be found")
+    if field.unsurveyed_walls:
+        objects.append(f"{plural(len(field.unsurveyed_walls), 'wall')} to be mapped")
     typer.echo(
         f"{file}: good: team {team.name!r}, {plural(len(team.robots), 'robot')}"
         f" ({', '.join(team.robots)}), {', '.join(objects)}"

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from cpcbl_launch.mapping.mapper import Mapped
+from cpcbl_launch.mapping.wall_advice import wall_advice
 from cpcbl_launch.reporting.metrics import Ellipse, Floats
 
 WEAK_M = 0.05  # of the major sigma, from which on a landmark is badly known
@@ -28,26 +29,30 @@ class _View(NamedTuple):
 
 
 def advice(mapped: Mapped) -> Iterator[str]:
-    """One line for each landmark that is badly known, and one for the frame."""
-    shapes = {n: mapped.ellipse(n) for n in mapped.names if n not in mapped.frame.known}
-    if not shapes:
-        return
-    typical = float(np.median([shape.major_m for shape in shapes.values()]))
+    """One line for each landmark and wall that is badly known, and one for the frame."""
+    shapes = {n: mapped.ellipse(n) for n in mapped.new_names}
+    typical = float(np.median([shape.major_m for shape in shapes.values()])) if shapes else WEAK_M
     limit = min(WEAK_M, max(WORTH_M, WEAK_TIMES * typical))
     weak = {name: shape for name, shape in shapes.items() if shape.major_m > limit}
-    turning = _turning_sigma(mapped)
+    turning = _turning_sigma(mapped) if shapes else 0.0
     by_frame = [n for n in weak if _turned_m(mapped, n, turning) > OF_FRAME * weak[n].major_m]
     if by_frame:
         yield _frame_advice(mapped, by_frame, weak, turning)
     for name, shape in weak.items():
         if name not in by_frame:
             yield _landmark_advice(mapped, name, shape)
+    if mapped.frame.gauge is not None and mapped.frame.gauge.along is not None:
+        yield (
+            "nothing that is known tells the position along the known walls: measure the place of a"
+            " landmark, or of a wall across them"
+        )
+    yield from wall_advice(mapped, turning)
 
 
 def _centre(mapped: Mapped) -> Floats:
     """Around which the map may turn: the middle of the known landmarks, else the first pose of the
     drive that fixes the frame."""
-    known = [mapped.landmark(n)[0] for n in mapped.names if n in mapped.frame.known]
+    known = [mapped.landmark(n)[0] for n in mapped.names if n in mapped.frame.known_names]
     if known:
         return np.asarray(np.mean(known, axis=0))
     gauge = mapped.frame.gauge
@@ -60,11 +65,12 @@ def _turning_sigma(mapped: Mapped) -> float:
     offset = mapped.problem.parts(mapped.solution.x)[1] - _centre(mapped)
     squared = np.sum(offset**2, axis=1)
     across = np.stack([-offset[:, 1], offset[:, 0]], axis=1)
-    new = [name not in mapped.frame.known for name in mapped.names]
+    new = [name not in mapped.frame.known_names for name in mapped.names]
     counts = np.array(new) & (squared > NEAR_M**2)
     gain = np.where(counts[:, None], across / np.maximum(squared, 1e-9)[:, None], 0.0).ravel()
     gain /= max(int(counts.sum()), 1)
-    return math.sqrt(max(float(gain @ mapped.covariance @ gain), 0.0))
+    of_landmarks = mapped.covariance[: len(gain), : len(gain)]
+    return math.sqrt(max(float(gain @ of_landmarks @ gain), 0.0))
 
 
 def _turned_m(mapped: Mapped, name: str, turning: float) -> float:

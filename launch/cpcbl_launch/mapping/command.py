@@ -2,16 +2,17 @@
 
 from collections.abc import Collection, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from msgspec.structs import replace
 
 from cpcbl_launch.mapping.first_estimate import Request
 from cpcbl_launch.mapping.mapper import Mapped, Progress, build_map
-from cpcbl_launch.mapping.runs import read_runs, surveyed_landmarks
+from cpcbl_launch.mapping.runs import identity, read_runs, surveyed_landmarks
 from cpcbl_launch.reporting.metrics import write_tum
 from cpcbl_launch.reporting.recorded_file import read_recording
-from cpcbl_team.config import Landmark, Team
+from cpcbl_team.config import Landmark, Team, Wall
 from cpcbl_team.errors import InputError, nearest_name
 
 NONE = "none"  # as the only known landmark
@@ -37,8 +38,11 @@ def map_runs(
         _require("--start", (start,), team.robots)
         if team.robots[start].start is None:
             raise InputError(f"--start {start}: robots.{start} has no start in the team file")
-    fixed = known_landmarks(team, known, withheld)
-    return build_map(team, runs, Request(fixed, start, place_sigma_m), progress)
+    identities = tuple(identity(run) for run in runs)
+    places = known_places(team, known, withheld, identities)
+    request = Request(places.exact, start, place_sigma_m, rough=places.rough, walls=places.walls)
+    mapped = build_map(team, runs, request, progress)
+    return mapped._replace(notes=(*places.notes, *mapped.notes), runs=identities)
 
 
 def _different(names: Sequence[str]) -> list[str]:
@@ -49,17 +53,47 @@ def _different(names: Sequence[str]) -> list[str]:
     ]
 
 
-def known_landmarks(
-    team: Team, known: Sequence[str], withheld: Sequence[str]
-) -> dict[str, Landmark]:
-    """The landmarks that fix the frame. Raises InputError for a name that is not on the map."""
-    marks = team.map.landmarks
+class KnownPlaces(NamedTuple):
+    """What is known of places beforehand."""
+
+    exact: dict[str, Landmark]
+    rough: dict[str, Landmark]
+    walls: dict[str, Wall]
+    notes: tuple[str, ...] = ()
+
+
+def known_places(
+    team: Team, known: Sequence[str], withheld: Sequence[str], runs: Collection[str] = ()
+) -> KnownPlaces:
+    """The places of the team file that are used: those that are named, or all. `runs`: the
+    identities of the runs that are mapped; a place that was estimated from one of them is used only
+    if it is named. Raises InputError for a name that is not on the map."""
+    marks, walls = team.map.landmarks, team.map.walls
     if list(known) == [NONE]:
-        return {}
-    _require("--known", known, marks)
-    _require("--withhold", withheld, marks)
-    chosen = known or [name for name, mark in marks.items() if mark.is_exact]
-    return {name: marks[name] for name in chosen if name not in withheld}
+        return KnownPlaces({}, {}, {})
+    _require("--known", known, (*marks, *walls))
+    _require("--withhold", withheld, (*marks, *walls))
+    places: dict[str, Landmark | Wall] = {**marks, **walls}
+    mapped = {run.split()[-1] for run in runs}
+    again = [
+        name
+        for name, place in places.items()
+        if not known and mapped & {run.split()[-1] for run in place.mapped_from if run.strip()}
+    ]
+    chosen = [n for n in (known or places) if n not in withheld and n not in again]
+    own = {n: marks[n] for n in chosen if n in marks}
+    notes = (
+        (
+            f"the places of {', '.join(again)} in the team file come from these runs, which do not"
+            " count twice: they are estimated anew"
+        ),
+    )
+    return KnownPlaces(
+        {n: mark for n, mark in own.items() if mark.is_exact},
+        {n: mark for n, mark in own.items() if not mark.is_exact},
+        {n: walls[n] for n in chosen if n in walls},
+        notes if again else (),
+    )
 
 
 def _require(option: str, names: Collection[str], there: Collection[str]) -> None:

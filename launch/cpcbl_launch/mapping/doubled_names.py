@@ -1,7 +1,7 @@
 """Names that one robot saw at two places at once: two landmarks that have one name."""
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 
 import numpy as np
 
@@ -13,8 +13,13 @@ LEAST_FRAMES = 5
 LEAST_SHARE = 0.05  # of the frames in which the name is seen
 
 
-def doubled_names(runs: Sequence[RunInputs]) -> dict[str, str]:
-    """What is wrong with a name, by name: it is seen twice in one frame, far apart."""
+def doubled_names(runs: Sequence[RunInputs], walls: Collection[str] = ()) -> dict[str, str]:
+    """What is wrong with a name, by name: it is seen twice in one frame, far apart. (A wall is seen
+    where the perpendicular meets it, which is one place.)"""
+
+    def noun(name: str) -> str:
+        return "wall" if name in walls else "landmark"
+
     frames, apart = dict[str, int](), dict[str, list[float]]()
     for run in runs:
         for of_robot in run.frames.values():
@@ -26,9 +31,9 @@ def doubled_names(runs: Sequence[RunInputs]) -> dict[str, str]:
                         apart.setdefault(name, []).append(distance)
     return {
         name: (
-            f"landmark {name} is seen at two places at once in {len(each)} of its {frames[name]}"
-            f" frames, {np.median(each):.2f} m apart: two landmarks have this name, or others are"
-            " misread as it; it is not used"
+            f"{noun(name)} {name} is seen at two places at once in {len(each)} of its"
+            f" {frames[name]} frames, {np.median(each):.2f} m apart: two {noun(name)}s have this"
+            " name, or others are misread as it; it is not used"
         )
         for name, each in apart.items()
         if len(each) >= max(LEAST_FRAMES, LEAST_SHARE * frames[name])

@@ -69,6 +69,7 @@ class Drives(NamedTuple):
 
     drives: tuple[Drive, ...]
     landmarks: tuple[str, ...]  # names of what is seen and is neither robot nor wall
+    walls: tuple[str, ...]  # names of the walls that are seen
     left_out: Counter[str]  # sightings, by reason
     notes: tuple[str, ...]  # whole drives that are not used, and why
 
@@ -83,9 +84,11 @@ def build_drives(team: Team, runs: Sequence[RunInputs], ignored: Iterable[str] =
         drives += found
         left_out += lost
         notes += remarks
-    robots = {*team.robots, *(drive.robot for drive in drives)}
     seen = {used.sighting.id for drive in drives for used in drive.sightings}
-    return Drives(tuple(drives), tuple(sorted(seen - robots, key=natural)), left_out, tuple(notes))
+    landmarks = seen - set(team.robots) - team.map.all_walls.keys()
+    walls = seen & team.map.all_walls.keys()
+    marks, lines = (tuple(sorted(names, key=natural)) for names in (landmarks, walls))
+    return Drives(tuple(drives), marks, lines, left_out, tuple(notes))
 
 
 def natural(name: str) -> tuple[int, int, str]:
@@ -155,8 +158,6 @@ def _reason_against(
 ) -> str:
     if sighting.id in ignored:
         return "of robots that are not in the team"
-    if sighting.id in team.map.walls:
-        return "of walls, which this command does not estimate"
     sensor = team.robots[robot].sensor
     if sighting.id == robot or not (sensor.sees_robots if is_robot else sensor.sees_landmarks):
         return "of what the robot does not see by its settings"
@@ -170,7 +171,8 @@ def _reason_against(
 
 def _usable(team: Team, robot: str, sighting: Sighting) -> Sighting:
     """The sighting with those of its readings that the settings allow."""
-    gives = team.map.all_landmarks.get(sighting.id, Unsurveyed()).gives
+    wall = team.map.all_walls.get(sighting.id)
+    gives = (wall or team.map.all_landmarks.get(sighting.id, Unsurveyed())).gives
     far = (sighting.range_m or 0.0) > team.robots[robot].sensor.max_range_for_range_m
     return Sighting(
         sighting.id,

@@ -1,10 +1,13 @@
 """A first path and map of each drive alone, in its own frame: an EKF over pose and landmarks.
 
 Source: Smith, Self & Cheeseman (1990). Its start is the origin, looking along x. Its result is a
-start for least squares, so only those landmarks enter it whose range and bearing are both read.
+start for least squares, so only those landmarks and walls enter it whose range and bearing are both
+read. A wall is kept by the direction of its normal (away from where it was first seen), and by how
+far along that it is from the origin.
 """
 
 import math
+from collections.abc import Collection
 from typing import NamedTuple
 
 import numpy as np
@@ -48,18 +51,40 @@ class _Filter:
         p[:3, :3] += rotation @ noise @ rotation.T
 
     def correct(self, name: str, read: Floats, variances: Floats) -> None:
-        """Uses a range and a bearing (2,); a landmark that is new is added."""
+        """Uses a range and a bearing (2,) of a landmark; one that is new is added."""
         if name not in self.columns:
             self._add(name, read, variances)
             return
         at = self.columns[name]
-        columns = [0, 1, 2, at, at + 1]
         expected = np.array(expected_readings(self.mean[:3], self.mean[at : at + 2]))
         dx, dy = (self.mean[at : at + 2] - self.mean[:2]).tolist()
         r = max(float(expected[0]), 0.05)
         ux, uy, vx, vy = dx / r, dy / r, -dy / r**2, dx / r**2
         jacobian = np.array([[-ux, -uy, 0.0, ux, uy], [-vx, -vy, -1.0, vx, vy]])
-        innovation = read - expected
+        self._update(at, jacobian, read - expected, variances)
+
+    def correct_by_wall(self, name: str, read: Floats, variances: Floats) -> None:
+        """Uses the distance of a wall and the direction of it (2,); one that is new is added."""
+        if name not in self.columns:
+            self._add_wall(name, read, variances)
+            return
+        at = self.columns[name]
+        far, angle = self.mean[at : at + 2].tolist()
+        c, s = math.cos(angle), math.sin(angle)
+        distance = far - c * float(self.mean[0]) - s * float(self.mean[1])
+        towards = self.mean[2] + read[1] - angle
+        side = 1.0 if math.cos(towards) >= 0.0 else -1.0
+        turned = s * float(self.mean[0]) - c * float(self.mean[1])
+        jacobian = np.array(
+            [[-side * c, -side * s, 0.0, side, side * turned], [0.0, 0.0, -1.0, 0.0, 1.0]]
+        )
+        expected = np.array([side * distance, 0.0])
+        innovation = np.array([read[0], towards if side > 0.0 else towards - math.pi])
+        self._update(at, jacobian, innovation - expected, variances)
+
+    def _update(self, at: int, jacobian: Floats, innovation: Floats, variances: Floats) -> None:
+        """By the derivatives (2, 5) for the pose and the object in the columns `at`."""
+        columns = [0, 1, 2, at, at + 1]
         innovation[1] = math.remainder(innovation[1], math.tau)
         cross = self.covariance[:, columns] @ jacobian.T
         weights = np.linalg.inv(jacobian @ cross[columns] + np.diag(variances))
@@ -76,12 +101,27 @@ class _Filter:
         self.covariance = 0.5 * (covariance + covariance.T)
 
     def _add(self, name: str, read: Floats, variances: Floats) -> None:
-        n, angle = len(self.mean), self.mean[2] + read[1]
+        angle = self.mean[2] + read[1]
         c, s = math.cos(angle), math.sin(angle)
-        self.columns[name] = n
         place = self.mean[:2] + read[0] * np.array([c, s])
         by_pose = np.array([[1.0, 0.0, -read[0] * s], [0.0, 1.0, read[0] * c]])
         by_read = np.array([[c, -read[0] * s], [s, read[0] * c]])
+        self._append(name, place, by_pose, by_read, variances)
+
+    def _add_wall(self, name: str, read: Floats, variances: Floats) -> None:
+        angle = self.mean[2] + read[1]
+        c, s = math.cos(angle), math.sin(angle)
+        far = c * self.mean[0] + s * self.mean[1] + read[0]
+        turned = c * self.mean[1] - s * self.mean[0]
+        by_pose = np.array([[c, s, turned], [0.0, 0.0, 1.0]])
+        by_read = np.array([[1.0, turned], [0.0, 1.0]])
+        self._append(name, np.array([far, angle]), by_pose, by_read, variances)
+
+    def _append(
+        self, name: str, place: Floats, by_pose: Floats, by_read: Floats, variances: Floats
+    ) -> None:
+        """A new object (2,), with its derivatives by the pose (2, 3) and the reading (2, 2)."""
+        self.columns[name] = len(self.mean)
         cross = by_pose @ self.covariance[:3]
         own = by_pose @ self.covariance[:3, :3] @ by_pose.T
         own += by_read @ np.diag(variances) @ by_read.T
@@ -89,9 +129,9 @@ class _Filter:
         self.covariance = np.block([[self.covariance, cross.T], [cross, own]])
 
 
-def explore(drive: Drive, robots: frozenset[str]) -> LocalMap:
-    """The drive's path and map by its odometry and its sightings of landmarks, which are all that
-    are not of these robots."""
+def explore(drive: Drive, robots: frozenset[str], walls: Collection[str] = ()) -> LocalMap:
+    """The drive's path and map by its odometry and its sightings of walls and landmarks, which are
+    all that are not of these robots or walls."""
     own: dict[int, list[tuple[str, Floats, Floats]]] = {}
     number = 0
     for used in drive.sightings:
@@ -104,16 +144,20 @@ def explore(drive: Drive, robots: frozenset[str]) -> LocalMap:
                 used.inflation * np.maximum(sigmas, 1e-4) ** 2,
             )
             own.setdefault(used.pose, []).append(entry)
-            number += 1
+            number += used.sighting.id not in walls
     ekf, poses = _Filter(), list[Floats]()
     for index in range(len(drive.stamps_ns)):
         if index:
             ekf.predict(drive.motions[index - 1], drive.noises[index - 1])
         for name, read, variances in own.get(index, ()):
-            ekf.correct(name, read, variances)
+            if name in walls:
+                ekf.correct_by_wall(name, read, variances)
+            else:
+                ekf.correct(name, read, variances)
         poses.append(ekf.mean[:3].copy())
     path = np.array(poses)
-    return LocalMap(path, _medians(path, own), number)
+    places = _medians(path, own)
+    return LocalMap(path, {n: p for n, p in places.items() if n not in walls}, number)
 
 
 def _medians(path: Floats, own: dict[int, list[tuple[str, Floats, Floats]]]) -> dict[str, Floats]:

@@ -6,7 +6,8 @@ from typing import NamedTuple
 import numpy as np
 
 from cpcbl_launch.mapping.assemble import ConstantErrors, Frame
-from cpcbl_launch.mapping.displacements import displaced_landmarks
+from cpcbl_launch.mapping.contradictions import are_wrong, contradiction_words, contradictions
+from cpcbl_launch.mapping.displacements import displaced_places
 from cpcbl_launch.mapping.doubled_names import doubled_names
 from cpcbl_launch.mapping.drives import Drive, Drives, RunInputs, build_drives
 from cpcbl_launch.mapping.first_estimate import FirstEstimate, Request, first_estimate
@@ -14,6 +15,7 @@ from cpcbl_launch.mapping.noise import Noise, estimate_noise, with_noise
 from cpcbl_launch.mapping.problem import Problem
 from cpcbl_launch.mapping.sensor_check import sensor_fault
 from cpcbl_launch.mapping.solve import CONVERGED_M, Solution, covariances, solve
+from cpcbl_launch.mapping.stated import stated_places
 from cpcbl_launch.reporting.metrics import Ellipse, Floats, ellipse_of
 from cpcbl_team.config import Team
 from cpcbl_team.errors import InputError
@@ -32,22 +34,44 @@ class Mapped(NamedTuple):
 
     drives: tuple[Drive, ...]
     names: tuple[str, ...]  # of the landmarks, in the order of the unknowns
+    walls: tuple[str, ...]  # of the walls
     frame: Frame
     frame_words: str
     problem: Problem
     first_x: Floats  # the unknowns from which least squares began
     solution: Solution
-    covariance: Floats  # (2 landmarks, 2 landmarks), with the error of where a landmark seems to be
+    places: (
+        Floats  # (landmarks + walls, 2): x, y; then offset from its pivot and direction of walls
+    )
+    covariance: Floats  # of `places` in this order, with the error of where things seem to be
+    information: Floats  # of the border of the problem (see `covariances`)
     constant_sigmas: Floats  # (drives, 4)
     noise: Noise
     notes: tuple[str, ...]
     left_out: Mapping[str, int]  # sightings, by reason
+    runs: tuple[str, ...] = ()  # their identities
+
+    @property
+    def new_names(self) -> list[str]:
+        """The landmarks whose places are not known exactly."""
+        return [name for name in self.names if name not in self.frame.known_names]
 
     def landmark(self, name: str) -> tuple[Floats, Floats]:
         """The place of a landmark (2,) and its covariance (2, 2)."""
-        i = self.names.index(name)
+        return self._place(self.names.index(name))
+
+    def wall(self, name: str) -> tuple[Floats, Floats]:
+        """The offset (m) and direction (rad) of a wall, (2,), and their covariance (2, 2). The
+        offset is from the wall's pivot (see `Problem`), to the left of its direction."""
+        return self._place(len(self.names) + self.walls.index(name))
+
+    def pivot(self, name: str) -> Floats:
+        """The point (2,) from which the offset of a wall counts."""
+        return np.asarray(self.problem.pivots[self.walls.index(name)])
+
+    def _place(self, i: int) -> tuple[Floats, Floats]:
         part = slice(2 * i, 2 * i + 2)
-        return self.problem.parts(self.solution.x)[1][i], self.covariance[part, part]
+        return self.places[i], self.covariance[part, part]
 
     def ellipse(self, name: str) -> Ellipse:
         """That of one sigma of the place of a landmark (m, rad)."""
@@ -61,44 +85,67 @@ def build_map(
     """The map of these runs. Raises InputError where there is nothing to map."""
     progress(0.0)
     everything = build_drives(team, runs)
-    doubled = doubled_names(runs)
+    doubled = doubled_names(runs, team.map.all_walls)
     rare = _rare(everything, doubled)
     ignored = {*doubled, *rare}
     notes = [*everything.notes, *doubled.values()]
     notes += [
-        f"landmark {name} has {number} usable sightings, fewer than {LEAST_SIGHTINGS}: not used"
+        f"{_noun(team, name)} {name} has {number} usable sightings, fewer than {LEAST_SIGHTINGS}:"
+        " not used"
         for name, number in rare.items()
     ]
     notes += [
-        f"landmark {name} is known, but no robot saw it"
-        for name in request.known
-        if name not in everything.landmarks
+        f"{_noun(team, name)} {name} is known, but no robot saw it"
+        for name in (*request.known, *request.rough, *request.walls)
+        if name not in everything.landmarks and name not in everything.walls
     ]
-    robots = frozenset(team.robots)
     drives = []
     for drive in everything.drives:
-        if fault := sensor_fault(drive, robots):
+        if fault := sensor_fault(drive, frozenset(team.robots), team.map.all_walls):
             notes.append(f"{fault}: this drive is not used")
         else:
             drives.append(_without(drive, ignored))
+    while True:  # with fewer known places each time
+        drives, request, first, rough = _settled(team, drives, request, notes, progress)
+        mapped = _finished(first, rough, (*notes, *first.notes), everything, request, progress)
+        bad = contradictions(mapped.problem, mapped.solution.x, mapped.information)
+        words = [contradiction_words(bad, first.names)] if bad else []
+        if not are_wrong(bad):
+            return mapped._replace(notes=(*mapped.notes, *words))
+        notes += words
+        request = request.without([first.names[each.place] for each in bad])
+
+
+def _settled(
+    team: Team,
+    drives: list[Drive],
+    request: Request,
+    notes: list[str],
+    progress: Progress,
+) -> tuple[list[Drive], Request, FirstEstimate, Solution]:
+    """A first solution without what was moved, and the drives and the request without that. Adds to
+    the notes. Raises InputError."""
     for _ in range(MOST_ROUNDS):
         progress(0.1)
         first = _first_or_notes(team, drives, request, notes)
         progress(0.25)
         rough = solve(first.problem, first.x, ROUGHLY_M)
         of_drives = [drive.run for drive in first.drives]
-        faults = displaced_landmarks(first.problem, rough.x, first.names, of_drives)
+        faults = displaced_places(first.problem, rough.x, first.names, of_drives)
         if not faults:
             break
         if len(faults) > MOST_FAULTY * len(first.names):
-            raise InputError(_does_not_fit([first.names[fault.landmark] for fault in faults]))
-        names = {first.names[fault.landmark] for fault in faults}
+            raise InputError(_does_not_fit([first.names[fault.place] for fault in faults]))
+        names = {first.names[fault.place] for fault in faults}
         notes += [fault.words for fault in faults]
         drives = [_without(drive, names) for drive in drives]
-        known = {name: mark for name, mark in request.known.items() if name not in names}
-        request = request._replace(known=known)
+        request = request.without(names)
     progress(0.5)
-    return _finished(first, rough, (*notes, *first.notes), everything, request, progress)
+    return drives, request, first, rough
+
+
+def _noun(team: Team, name: str) -> str:
+    return "wall" if name in team.map.all_walls else "landmark"
 
 
 def _unusual(drives: Sequence[Drive], constants: Floats, errors: ConstantErrors) -> Iterator[str]:
@@ -146,24 +193,25 @@ def _finished(
     problem = with_noise(first.problem, noise)
     progress(0.6)
     solution = solve(problem, rough.x, CONVERGED_M)
-    if set(first.names) <= first.frame.known.keys():
-        notes = (*notes, "no landmark is new: choose with --known or --withhold what is estimated")
+    if set(first.names) <= first.frame.known_names:
+        notes = (*notes, "no place is new: choose with --known or --withhold what is estimated")
     notes = (*notes, *_unusual(first.drives, problem.parts(solution.x)[2], request.errors))
     if not solution.converged:
         notes = (*notes, f"least squares did not converge in {solution.iterations} steps")
     progress(0.95)
     found = covariances(problem, solution)
-    new = [name not in first.frame.known for name in first.names]
-    covariance = found.landmarks + np.diag(np.repeat(new, 2) * request.place_sigma_m**2)
+    stated = stated_places(problem, solution.x, found.places, first.names, first.frame)
     return Mapped(
         first.drives,
-        first.names,
+        first.names[: problem.landmarks],
+        first.names[problem.landmarks :],
         first.frame,
         first.frame_words,
         problem,
         first.x,
         solution,
-        covariance,
+        *stated,
+        found.information,
         found.constants,
         noise,
         notes,
@@ -172,7 +220,8 @@ def _finished(
 
 
 def _rare(everything: Drives, others: Collection[str]) -> dict[str, int]:
-    number = {name: 0 for name in everything.landmarks if name not in others}
+    names = (*everything.landmarks, *everything.walls)
+    number = {name: 0 for name in names if name not in others}
     for drive in everything.drives:
         for used in drive.sightings:
             if used.sighting.id in number:

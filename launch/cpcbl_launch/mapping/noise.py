@@ -107,12 +107,13 @@ def with_noise(problem: Problem, noise: Noise) -> Problem:
 
 
 def _objects(problem: Problem) -> Integers:
-    """A number of the object of each reading: the landmark, or the drive of the robot."""
+    """A number of the object of each reading: the landmark, the wall, or the drive of the robot."""
     readings = problem.readings
     of_pose = np.zeros(problem.poses, np.int64)
     of_pose[problem.motions.pose] = of_pose[problem.motions.pose + 1] = problem.motions.drive
     mate = of_pose[np.maximum(readings.mate, 0)]
-    return np.where(readings.mate >= 0, -1 - mate, readings.landmark)
+    places = np.where(readings.wall >= 0, problem.landmarks + readings.wall, readings.landmark)
+    return np.where(readings.mate >= 0, -1 - mate, places)
 
 
 def _inflation(readings: Readings, objects: Integers, correlation_s: Floats, old: Floats) -> Floats:

@@ -68,8 +68,10 @@ class NormalEquations:
             part = slice(first, first + CHUNK)
             eliminated = self._factors.solve(self._coupling[:, part].toarray())
             complement[:, part] -= self._coupling.T @ eliminated
+        self.information = 0.5 * (complement + complement.T)
+        """Of the border, poses being eliminated: the inverse of its covariance."""
         try:
-            self._cholesky = scipy.linalg.cho_factor(0.5 * (complement + complement.T))
+            self._cholesky = scipy.linalg.cho_factor(self.information)
         except (np.linalg.LinAlgError, ValueError) as error:  # not positive definite, not finite
             raise UndeterminedError(UNDETERMINED) from error
 

@@ -1,9 +1,13 @@
 """The least squares problem: its unknowns, its residuals in units of their sigma, and the Jacobian.
 
-The unknowns are the poses of all drives (x, y, heading), the landmarks (x, y), and four constant
-errors of each drive: shares of its odometry's distance and turn, the bias of its bearings, the
-share of its ranges. A reading is expected as (1 + share) times what the unknowns say. If instead
-the reading were scaled, a smaller map would have smaller residuals, and the map would shrink.
+The unknowns are the poses of all drives (x, y, heading), the landmarks (x, y), the walls (offset,
+direction), and four constant errors of each drive: shares of its odometry's distance and turn, the
+bias of its bearings, the share of its ranges. A reading is expected as (1 + share) times what the
+unknowns say. If instead the reading were scaled, a smaller map would have smaller residuals, and
+the map would shrink.
+
+The offset of a wall is that from its pivot, a fixed point near it, along its normal, which points
+to the left of its direction.
 """
 
 import math
@@ -33,8 +37,9 @@ class Readings(NamedTuple):
     """Ranges and bearings; NaN: not measured."""
 
     pose: Integers  # (s,), of the observer
-    landmark: Integers  # (s,), -1: a robot is seen
-    mate: Integers  # (s,), the pose of the robot that is seen; -1: a landmark is
+    landmark: Integers  # (s,), -1: a robot or a wall is seen
+    wall: Integers  # (s,), -1: a robot or a landmark is seen
+    mate: Integers  # (s,), the pose of the robot that is seen; -1: a landmark or a wall is
     drive: Integers  # (s,)
     range_m: Floats
     bearing: Floats
@@ -46,11 +51,19 @@ class Readings(NamedTuple):
 
 
 class Priors(NamedTuple):
-    """What single unknowns are known to be. Shapes (p,)."""
+    """What unknowns are known to be, in rows of two: the sum of factor * (unknown - value) has the
+    standard deviation 1. Shapes (p, 2); the second factor is 0 where one unknown stands alone."""
 
-    column: Integers
-    value: Floats
-    sigma: Floats
+    columns: Integers
+    values: Floats
+    factors: Floats
+
+    def residuals(self, x: Floats) -> Floats:
+        """In units of sigma, shape (p,)."""
+        return np.asarray(np.sum(self.factors * (x[self.columns] - self.values), axis=1))
+
+
+NO_PRIORS = Priors(np.empty((0, 2), np.int64), np.empty((0, 2)), np.empty((0, 2)))
 
 
 class Problem(NamedTuple):
@@ -58,6 +71,7 @@ class Problem(NamedTuple):
 
     poses: int
     landmarks: int
+    pivots: Floats  # (walls, 2)
     drives: int
     in_time: Integers  # (poses,), the poses in the order of runs, and there of time
     motions: Motions
@@ -65,19 +79,31 @@ class Problem(NamedTuple):
     priors: Priors
 
     @property
+    def walls(self) -> int:
+        return len(self.pivots)
+
+    @property
     def size(self) -> int:
-        return 3 * self.poses + 2 * self.landmarks + CONSTANTS * self.drives
+        return self.constant_column(self.drives)
 
     def landmark_column(self, landmark: int = 0) -> int:
         return 3 * self.poses + 2 * landmark
 
+    def wall_column(self, wall: int = 0) -> int:
+        return self.landmark_column(self.landmarks) + 2 * wall
+
     def constant_column(self, drive: int = 0) -> int:
-        return 3 * self.poses + 2 * self.landmarks + CONSTANTS * drive
+        return self.wall_column(self.walls) + CONSTANTS * drive
 
     def parts(self, x: Floats) -> tuple[Floats, Floats, Floats]:
         """The poses (n, 3), landmarks (l, 2) and constant errors (d, 4) among the unknowns."""
-        poses, landmarks, constants = np.split(x, (self.landmark_column(), self.constant_column()))
+        poses, landmarks = x[: self.landmark_column()], x[self.landmark_column() :]
+        landmarks, constants = landmarks[: 2 * self.landmarks], x[self.constant_column() :]
         return poses.reshape(-1, 3), landmarks.reshape(-1, 2), constants.reshape(-1, CONSTANTS)
+
+    def lines(self, x: Floats) -> Floats:
+        """The walls among the unknowns: offset (m) and direction (rad), shape (w, 2)."""
+        return x[self.wall_column() : self.constant_column()].reshape(-1, 2)
 
 
 class Weights(NamedTuple):
@@ -147,7 +173,7 @@ def reading_blocks(problem: Problem, x: Floats) -> Blocks:
     those that were not measured: r = 2, c = 7."""
     readings = problem.readings
     poses, landmarks, constants = problem.parts(x)
-    mate, is_mate = readings.mate, readings.mate >= 0
+    mate, is_mate, is_wall = readings.mate, readings.mate >= 0, readings.wall >= 0
     places = np.where(
         is_mate[:, None], poses[mate, :2], landmarks[readings.landmark] if len(landmarks) else 0.0
     )
@@ -164,13 +190,17 @@ def reading_blocks(problem: Problem, x: Floats) -> Blocks:
     d[:, 0, 0], d[:, 0, 1], d[:, 0, 3], d[:, 0, 4], d[:, 0, 5] = ux, uy, -ux, -uy, -r
     d[:, 1, 0], d[:, 1, 1], d[:, 1, 3], d[:, 1, 4], d[:, 1, 6] = vx, vy, -vx, -vy, -1.0
     d[:, 1, 2] = 1.0
-    residuals = np.stack([ranges / readings.range_sigma, bearings / readings.bearing_sigma], axis=1)
-    d[:, 0] /= readings.range_sigma[:, None]
-    d[:, 1] /= readings.bearing_sigma[:, None]
+    residuals = np.stack([ranges, bearings], axis=1)
+    if problem.walls:
+        residuals[is_wall], d[is_wall] = _of_walls(problem, x)
+    sigmas = np.stack([readings.range_sigma, readings.bearing_sigma], axis=1)
+    residuals /= sigmas
+    d /= sigmas[..., None]
     unread = np.isnan(residuals)
     residuals[unread] = 0.0
     d[unread] = 0.0
     place = np.where(is_mate, 3 * mate, problem.landmark_column() + 2 * readings.landmark)
+    place = np.where(is_wall, problem.wall_column() + 2 * readings.wall, place)
     constant = problem.constant_column() + CONSTANTS * readings.drive
     columns = np.concatenate(
         [
@@ -181,6 +211,47 @@ def reading_blocks(problem: Problem, x: Floats) -> Blocks:
         axis=1,
     )
     return Blocks(residuals, d, columns)
+
+
+class WallViews(NamedTuple):
+    """From where walls are seen, of the readings (v,) of walls."""
+
+    distance_m: Floats  # signed: positive to the left of the wall
+    side: Floats  # 1: the reading is from the left of the wall, -1: from its right
+    along_m: Floats  # along its direction, from its pivot
+
+
+def wall_views(problem: Problem, x: Floats) -> WallViews:
+    """Their poses tell the side."""
+    readings = problem.readings
+    mine = readings.wall >= 0
+    wall = readings.wall[mine]
+    own, (offset, direction) = problem.parts(x)[0][readings.pose[mine]], problem.lines(x)[wall].T
+    dx, dy = (own[:, :2] - problem.pivots[wall]).T
+    c, s = np.cos(direction), np.sin(direction)
+    distance = c * dy - s * dx - offset
+    return WallViews(distance, np.where(distance >= 0.0, 1.0, -1.0), c * dx + s * dy)
+
+
+def _of_walls(problem: Problem, x: Floats) -> tuple[Floats, Floats]:
+    """Residuals (v, 2) in metres and radians, and their derivatives (v, 2, 7), of the readings of
+    walls: their range is the perpendicular distance, their bearing the direction of it."""
+    readings = problem.readings
+    mine = readings.wall >= 0
+    poses, _, constants = problem.parts(x)
+    drive, direction = readings.drive[mine], problem.lines(x)[readings.wall[mine], 1]
+    distance, side, along = wall_views(problem, x)
+    share, bias = constants[drive, RANGE], constants[drive, BEARING]
+    ranges = readings.range_m[mine] - (1.0 + share) * side * distance
+    towards = direction - side * (0.5 * np.pi)
+    own_heading = poses[readings.pose[mine], 2]
+    bearings = wrap_angles(readings.bearing[mine] - towards + own_heading - bias)
+    d = np.zeros((len(side), 2, 7))  # by own x, y, h, offset, direction, share, bias
+    k = (1.0 + share) * side
+    d[:, 0, 0], d[:, 0, 1] = k * np.sin(direction), -k * np.cos(direction)
+    d[:, 0, 3], d[:, 0, 4], d[:, 0, 5] = k, k * along, -side * distance
+    d[:, 1, 2], d[:, 1, 4], d[:, 1, 6] = 1.0, -1.0, -1.0
+    return np.stack([ranges, bearings], axis=1), d
 
 
 # All of it ----------------------------------------------------------------------------------------
@@ -210,12 +281,13 @@ def linearize(problem: Problem, x: Floats, weights: Weights) -> Linearized:
         values.append((blocks.derivatives * factor[..., None]).ravel())
         first += k * r
     priors = problem.priors
-    parts.append((x[priors.column] - priors.value) / priors.sigma)
-    rows.append(first + np.arange(len(priors.column)))
-    columns.append(priors.column)
-    values.append(1.0 / priors.sigma)
+    number = len(priors.columns)
+    parts.append(priors.residuals(x))
+    rows.append(np.repeat(first + np.arange(number), 2))
+    columns.append(priors.columns.ravel())
+    values.append(priors.factors.ravel())
     entries = np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))
-    shape = first + len(priors.column), problem.size
+    shape = first + number, problem.size
     return Linearized(np.concatenate(parts), sparse.csr_matrix(entries, shape=shape))
 
 

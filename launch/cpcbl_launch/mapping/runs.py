@@ -1,7 +1,10 @@
 """What robots reported, from MRCLAM folders and from recordings of `up --record`."""
 
 from collections.abc import Sequence
+from hashlib import blake2b
 from pathlib import Path
+
+import msgspec
 
 from cpcbl_agents.sources import mrclam
 from cpcbl_agents.sources.mrclam import LogError
@@ -17,6 +20,15 @@ def read_runs(files: Sequence[Path], names: Sequence[str]) -> list[RunInputs]:
         _recording(file, name) if file.suffix == ".mcap" else _mrclam(file, name)
         for file, name in zip(files, names, strict=True)
     ]
+
+
+def identity(run: RunInputs) -> str:
+    """The name of a run, and a digest of what its robots reported: the same for a copy of it."""
+    digest = blake2b(digest_size=4)
+    for of_robot in (run.odometry, run.frames):
+        for robot in sorted(of_robot):
+            digest.update(robot.encode() + msgspec.json.encode(of_robot[robot]))
+    return f"{run.name} {digest.hexdigest()}"
 
 
 def _recording(file: Path, name: str) -> RunInputs:

@@ -7,6 +7,7 @@ bearings with the wrong sign.
 """
 
 import math
+from collections.abc import Collection, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -42,12 +43,12 @@ def odometry_path(drive: Drive) -> Floats:
     return np.column_stack([place.real, place.imag, heading])
 
 
-def sensor_fault(drive: Drive, robots: frozenset[str]) -> str:
+def sensor_fault(drive: Drive, robots: frozenset[str], walls: Collection[str] = ()) -> str:
     """What is wrong with all ranges or bearings of a drive; empty if nothing shows."""
-    moved, seen, mirrored = _pairs(drive, odometry_path(drive), robots)
+    moved, seen, other_moved, mirrored = _pairs(drive, odometry_path(drive), robots, walls)
     if len(moved) < LEAST_PAIRS:
         return ""
-    plain, mirror = _fit(moved, seen), _fit(moved, mirrored)
+    plain, mirror = _fit(moved, seen), _fit(other_moved, mirrored)
     is_better = BETTER * (1.0 - mirror.coherence) < 1.0 - plain.coherence
     if mirror.coherence > COHERENT and is_better:
         return (
@@ -78,11 +79,12 @@ def unit_words(factor: float) -> str:
 
 
 def _pairs(
-    drive: Drive, path: Floats, robots: frozenset[str]
-) -> tuple[Complexes, Complexes, Complexes]:
-    """Motions by odometry, by sightings, by mirrored sightings; complex, shape (pairs,)."""
+    drive: Drive, path: Floats, robots: frozenset[str], walls: Collection[str]
+) -> Sequence[Complexes]:
+    """Motions by odometry and by sightings, and the same with mirrored bearings; complex, shapes
+    (pairs,). By two sightings of a wall only a motion towards it is seen."""
     last: dict[str, tuple[int, int, complex]] = {}
-    rows = list[tuple[complex, complex, complex]]()
+    rows = list[tuple[complex, complex, complex, complex]]()
     for used in drive.sightings:
         name, r, b = used.sighting.id, used.sighting.range_m, used.sighting.bearing_rad
         if name in robots or r is None or b is None:
@@ -96,18 +98,32 @@ def _pairs(
             moved = complex(*(path[used.pose, :2] - path[pose, :2]))
             if seconds < MOST_S and abs(moved) > LEAST_MOVED_M:
                 u, v = np.exp(1j * path[[pose, used.pose], 2]).tolist()
-                rows.append(
-                    (moved, u * before - v * now, u * before.conjugate() - v * now.conjugate())
+                plain, mirror = (
+                    _motion(moved, u * a, v * b, name in walls)
+                    for a, b in ((before, now), (before.conjugate(), now.conjugate()))
                 )
+                if min(abs(plain[0]), abs(mirror[0])) > LEAST_MOVED_M:
+                    rows.append((*plain, *mirror))
         last[name] = used.stamp_ns, used.pose, now
-    table = np.array(rows, dtype=np.complex128).reshape(-1, 3)
-    return table[:, 0], table[:, 1], table[:, 2]
+    return list(np.array(rows, dtype=np.complex128).reshape(-1, 4).T)
+
+
+def _motion(
+    moved: complex, before: complex, now: complex, is_wall: bool
+) -> tuple[complex, complex]:
+    """A motion, and the same by two sightings of a landmark; or its part towards a wall, and the
+    same by the wall's distances."""
+    if not is_wall:
+        return moved, before - now
+    mean = before / abs(before) + now / abs(now)
+    unit = mean / max(abs(mean), 1e-9)
+    return (unit.conjugate() * moved).real * unit, (abs(before) - abs(now)) * unit
 
 
 def _fit(moved: Complexes, seen: Complexes) -> _Fit:
     """Robust against single wrong names: pairs of very different length do not count."""
-    ratio = np.abs(seen) / np.abs(moved)
-    near = np.abs(np.log(np.maximum(ratio, 1e-9) / np.median(ratio))) < math.log(3.0)
+    ratio = np.maximum(np.abs(seen) / np.abs(moved), 1e-9)
+    near = np.abs(np.log(ratio / np.median(ratio))) < math.log(3.0)
     a, b = moved[near], seen[near]
     product = np.sum(np.conj(a) * b)
     square_a, square_b = np.sum(np.abs(a) ** 2), np.sum(np.abs(b) ** 2)

@@ -55,17 +55,16 @@ def robust_weights(problem: Problem, x: Floats) -> tuple[Weights, float]:
     huber = np.minimum(1.0, HUBER_SIGMAS / np.maximum(moved, 1e-12))
     small = np.minimum(moved, HUBER_SIGMAS)
     loss += float(np.sum(3.0 * small * (2.0 * moved - small)))
-    priors = problem.priors
-    loss += float(np.sum(((x[priors.column] - priors.value) / priors.sigma) ** 2))
+    loss += float(np.sum(problem.priors.residuals(x) ** 2))
     return Weights(np.sqrt(huber), 1.0 / np.sqrt(1.0 + square / c2)), 0.5 * loss
 
 
 def solve(problem: Problem, start: Floats, least_step_m: float = CONVERGED_M) -> Solution:
     """The unknowns with the least robust cost near `start`, shape (unknowns,). It ends when a step
-    moves no landmark by `least_step_m`."""
+    moves no landmark or wall by `least_step_m` (m; the direction of a wall in rad)."""
     x, damping, order = start.copy(), 1e-4, elimination_order(problem)
     weights, cost = robust_weights(problem, x)
-    landmarks = slice(problem.landmark_column(), problem.constant_column())
+    places = slice(problem.landmark_column(), problem.constant_column())
     for iteration in range(1, ITERATIONS + 1):
         linear = linearize(problem, x, weights)
         gradient = linear.jacobian.T @ linear.residuals
@@ -79,7 +78,7 @@ def solve(problem: Problem, start: Floats, least_step_m: float = CONVERGED_M) ->
         if gained >= 0.0:
             x, weights, cost = x + step, trial_weights, trial_cost
         damping = max(damping * 0.05, LEAST_DAMPING)
-        small = np.abs(step[landmarks]).max(initial=0.0) < least_step_m and damping < 1.0
+        small = np.abs(step[places]).max(initial=0.0) < least_step_m and damping < 1.0
         if small or gained < 1e-9 * (1e-6 + cost):
             return Solution(x, weights, cost, iteration, True)
     return Solution(x, weights, cost, ITERATIONS, False)
@@ -107,14 +106,16 @@ def _step(
 class Covariances(NamedTuple):
     """What a solution says of its own accuracy."""
 
-    landmarks: Floats  # (2 landmarks, 2 landmarks)
+    places: Floats  # (2 (landmarks + walls), the same): x, y; then offset, direction of walls
     constants: Floats  # (drives, 4): sigmas of the constant errors
+    information: Floats  # of the border: the inverse of its covariance; it ends with these two
 
 
 def covariances(problem: Problem, solution: Solution) -> Covariances:
-    """The covariance of all landmarks, and the sigmas of the constant errors."""
-    border = solved_equations(problem, solution).border_covariance()
+    """The covariance of all landmarks and walls, and the sigmas of the constant errors."""
+    equations = solved_equations(problem, solution)
+    border = equations.border_covariance()
     first = len(border) - (problem.size - problem.landmark_column())
-    middle = first + 2 * problem.landmarks
+    middle = first + 2 * (problem.landmarks + problem.walls)
     constants = np.sqrt(np.maximum(np.diag(border)[middle:], 0.0)).reshape(-1, CONSTANTS)
-    return Covariances(border[first:middle, first:middle], constants)
+    return Covariances(border[first:middle, first:middle], constants, equations.information)

@@ -13,7 +13,7 @@ _SEED = 2**29  # apart from robots' own noise
 def true_map(team: Team, seed: int) -> Field:
     """The true places of all objects, also of those that nobody has surveyed. Those of the map have
     an error each: its standard deviations are the map's times the simulation's noise."""
-    if team.map.is_exact:
+    if team.map.is_exact and not team.map.unsurveyed_walls:
         return team.map
     noise = team.simulation.noise
     found = {
@@ -27,6 +27,11 @@ def true_map(team: Team, seed: int) -> Field:
         n: _true_landmark(team.map, n, m, seed, noise) for n, m in team.map.landmarks.items()
     }
     walls = {n: _true_wall(team.map, n, wall, seed, noise) for n, wall in team.map.walls.items()}
+    walls |= {
+        name: Wall(from_m=hidden.true_from_m, to_m=hidden.true_to_m, gives=hidden.gives)
+        for name, hidden in team.map.unsurveyed_walls.items()
+        if hidden.true_from_m is not None and hidden.true_to_m is not None
+    }
     return Field(landmarks=landmarks | found, walls=walls)
 
 

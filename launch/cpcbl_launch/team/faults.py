@@ -22,6 +22,7 @@ NAMED = (
     "map.landmarks",
     "map.unsurveyed",
     "map.walls",
+    "map.unsurveyed_walls",
 )  # their names become part of keys
 _WORDS = {
     "object": "a table",

@@ -12,7 +12,8 @@ LARGEST_SHARE = 0.25  # of the map's size, that its own errors may have
 
 def map_problems(team: Team) -> Iterator[str]:
     """The contradictions in a map, each as `key: problem; fix`."""
-    names = [*team.map.landmarks, *team.map.unsurveyed, *team.map.walls]
+    field = team.map
+    names = [*field.landmarks, *field.unsurveyed, *field.walls, *field.unsurveyed_walls]
     for twice in sorted({n for n in names if names.count(n) > 1 or n in team.robots}):
         yield f"map: {twice!r} names two things; rename one of them"
     for name, wall in team.map.walls.items():
@@ -33,6 +34,13 @@ def map_problems(team: Team) -> Iterator[str]:
             yield (
                 f"map.unsurveyed.{name}.true_m: the simulated field needs it; write where the"
                 " landmark stands, which no robot is told"
+            )
+    for name, hidden in team.map.unsurveyed_walls.items():
+        ends = hidden.true_from_m, hidden.true_to_m
+        if simulated and (None in ends or ends[0] == ends[1]):
+            yield (
+                f"map.unsurveyed_walls.{name}: the simulated field needs true_from_m and true_to_m;"
+                " write where the wall stands, which no robot is told"
             )
 
 

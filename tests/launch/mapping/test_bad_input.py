@@ -185,5 +185,5 @@ def test_a_guest_is_no_landmark_and_a_map_that_is_known_says_so() -> None:
     assert mapped.left_out["of robots that are not in the team"] > 0
     assert mapped.notes == (
         "day1: robot r3 is not in the team, so it is not used",
-        "no landmark is new: choose with --known or --withhold what is estimated",
+        "no place is new: choose with --known or --withhold what is estimated",
     )

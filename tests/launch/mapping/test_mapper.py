@@ -1,16 +1,16 @@
 """Maps of simulated runs: exact without noise, consistent with it, in the frame that is asked."""
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 import pytest
 from msgspec.structs import replace
+from support.mapped_worlds import errors_of
 from support.mapping_worlds import World, make_world
 
+from cpcbl_launch.mapping.command import KnownPlaces, known_places
 from cpcbl_launch.mapping.first_estimate import Request
 from cpcbl_launch.mapping.mapper import Mapped, build_map
-from cpcbl_launch.reporting.metrics import Floats
 from cpcbl_team.config import Landmark
 
 KNOWN = ("door", "lamp")
@@ -21,24 +21,6 @@ BLIND = ("r2", "r4", "r5")
 def mapped_world(world: World, known: tuple[str, ...] = KNOWN, start: str = "") -> Mapped:
     marks = {name: world.team.map.landmarks[name] for name in known}
     return build_map(world.team, world.runs, Request(marks, start, place_sigma_m=0.0))
-
-
-class Errors(NamedTuple):
-    errors: Floats  # (2 n,) of the landmarks that were not known
-    covariance: Floats  # (2 n, 2 n)
-
-    @property
-    def nees(self) -> float:
-        """Of each degree of freedom: 1 is consistent."""
-        return float(self.errors @ np.linalg.solve(self.covariance, self.errors) / len(self.errors))
-
-
-def errors_of(mapped: Mapped, world: World) -> Errors:
-    new = [i for i, name in enumerate(mapped.names) if name not in mapped.frame.known]
-    columns = np.array([(2 * i, 2 * i + 1) for i in new]).ravel()
-    found = mapped.problem.parts(mapped.solution.x)[1].ravel()[columns]
-    truth = np.array([world.places[mapped.names[i]] for i in new]).ravel()
-    return Errors(found - truth, mapped.covariance[np.ix_(columns, columns)])
 
 
 @pytest.mark.parametrize(
@@ -171,12 +153,12 @@ def test_errors_that_last_make_the_covariance_no_smaller_than_they_are() -> None
     assert np.mean(nees) < 1.95
 
 
-def test_a_landmark_that_was_mapped_before_does_not_fix_the_frame() -> None:
-    from cpcbl_launch.mapping.command import known_landmarks
-
+def test_a_landmark_that_was_mapped_before_is_not_known_exactly() -> None:
     team = make_world(seconds=1.0).team
     marks = {**team.map.landmarks, "desk": Landmark(x_m=1.0, y_m=2.0, sigma_m=0.02)}
     team = replace(team, map=replace(team.map, landmarks=marks))
-    assert set(known_landmarks(team, (), ("door",))) == {"lamp", "rack", "pole", "sofa"}
-    assert set(known_landmarks(team, ("desk",), ())) == {"desk"}
-    assert known_landmarks(team, ("none",), ()) == {}
+    places = known_places(team, (), ("door",))
+    assert set(places.exact) == {"lamp", "rack", "pole", "sofa"}
+    assert set(places.rough) == {"desk"}
+    assert set(known_places(team, ("desk",), ()).rough) == {"desk"}
+    assert known_places(team, ("none",), ()) == KnownPlaces({}, {}, {})

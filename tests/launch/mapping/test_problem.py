@@ -4,7 +4,9 @@ import math
 
 import numpy as np
 import pytest
-from support.mapping_worlds import make_world
+from msgspec.structs import replace
+from support.mapped_worlds import exact_walls
+from support.mapping_worlds import ROOM, make_world
 
 from cpcbl_launch.mapping.align import Rigid, fit_rigid
 from cpcbl_launch.mapping.first_estimate import Request
@@ -25,10 +27,12 @@ KNOWN = ("door", "lamp")
 
 
 def small_problem(seed: int = 3) -> tuple[Problem, Floats]:
-    """A problem with landmarks and teammates, and unknowns that are off its solution."""
-    world = make_world(seed, robots=2, seconds=6.0)
+    """A problem with landmarks, walls and teammates, and unknowns that are off its solution."""
+    world = make_world(seed, robots=2, seconds=8.0, walls=ROOM)
     known = {name: world.team.map.landmarks[name] for name in KNOWN}
-    mapped = build_map(world.team, world.runs, Request(known, place_sigma_m=0.01))
+    walls = {"south": replace(exact_walls(ROOM)["south"], sigma_m=0.1, direction_sigma_deg=1.0)}
+    mapped = build_map(world.team, world.runs, Request(known, place_sigma_m=0.01, walls=walls))
+    assert mapped.problem.walls >= 3
     rng = np.random.default_rng(seed)
     return mapped.problem, mapped.solution.x + 0.02 * rng.standard_normal(mapped.problem.size)
 
