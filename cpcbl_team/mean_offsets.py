@@ -79,6 +79,19 @@ def about_position(evidence: Sums, heading_variance: float) -> tuple[Covariance2
     return matrix, (x - k * xh * h, y - k * yh * h)
 
 
+def with_heading_error(evidence: Sums, variance: float) -> Sums:
+    """The evidence of one report, whose heading has an error of its own of this variance (rad^2):
+    that of the estimate changes from one report to the next, with odometry and corrections. What
+    bearings of several frames would tell of the position together otherwise is that change."""
+    (xx, xy, yy, xh, yh, hh), (x, y, h) = evidence
+    k = variance / (1.0 + variance * hh)
+    rest = 1.0 - k * hh
+    return (
+        (xx - k * xh * xh, xy - k * xh * yh, yy - k * yh * yh, rest * xh, rest * yh, rest * hh),
+        (x - k * xh * h, y - k * yh * h, rest * h),
+    )
+
+
 class FadingOffsets(NamedTuple):
     """Fading sums over the reports of one source."""
 

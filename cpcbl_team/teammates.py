@@ -19,7 +19,7 @@ from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.inflation import inflate_by_offset, inflate_to
 from cpcbl_team.inputs import Belief, Input, LandmarkBelief, Position, Sightings
 from cpcbl_team.landmarks import LandmarkUpdate
-from cpcbl_team.mean_offsets import HEADING_VARIANCE, NOTHING, about_position
+from cpcbl_team.mean_offsets import HEADING_VARIANCE, NOTHING, about_position, with_heading_error
 from cpcbl_team.measurements import (
     GatedObject,
     GatedObjects,
@@ -286,7 +286,7 @@ def _own_offset(state: State, sums: Information, accepted: Iterable[GatedObject]
     """What the robot's own sensors say of the offset of the estimate in one frame."""
     common, variance = state.common_errors, state.estimate.covariance.hh
     if common is None:
-        return _evidence_at(state, sums)
+        return _evidence_at(state, with_heading_error(sums, variance))
     of_parameter: dict[int, Information] = {}
     for found in accepted:
         if not found.measurement.sender:
@@ -307,11 +307,12 @@ def _own_offset(state: State, sums: Information, accepted: Iterable[GatedObject]
 
 
 def _with_camera(state: State, m: Measurement, evidence: OffsetEvidence) -> OffsetEvidence:
-    """What a sighting of a teammate says of the offset, with the constant errors of the camera
-    in it."""
+    """What a sighting of a teammate says of the offset, with the errors of the heading and the
+    constant errors of the camera in it."""
     common = state.common_errors
     if common is None:
-        return evidence
+        sums = with_heading_error(evidence.evidence, evidence.heading_variance)
+        return evidence._replace(evidence=sums)
     (yy, _, ff), pose = common.camera_covariance, state.estimate.pose
     x, y, covariance = m.position
     squared = (x - pose.x) ** 2 + (y - pose.y) ** 2

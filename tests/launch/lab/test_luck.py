@@ -30,7 +30,7 @@ FOUND = {
     "budget leak": ("in budget", 12),
     "fresh budget": ("in budget", 1),
     "free beliefs": ("in budget", 12),
-    "quarantine ignored": ("quarantined", 10),
+    "quarantine ignored": ("quarantined", 3),
 }
 """Planted bugs, by the invariant that finds each, and a seed whose history shows it."""
 MOST_SEEDS, MOST_EVENTS = 15, 20

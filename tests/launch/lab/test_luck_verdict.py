@@ -1,4 +1,5 @@
-"""From when a robot that was carried away can be expected to know it."""
+"""From when a robot that was carried away can be expected to know it, and which quarantines should
+be over."""
 
 import math
 
@@ -7,8 +8,8 @@ from msgspec.structs import replace
 
 from cpcbl_launch.lab.chaos.run_log import RunLog
 from cpcbl_launch.lab.luck.history import Event
-from cpcbl_launch.lab.luck.verdict import NOTICED, noticeable_s
-from cpcbl_transport.messages import Status
+from cpcbl_launch.lab.luck.verdict import ENOUGH_REPORTS, NOTICED, noticeable_s, quarantines
+from cpcbl_transport.messages import Status, Trust
 
 CARRIED = Event(0, "kidnap", "guide1", 10.0, 10.0, 2.0)
 STATUS = Status("guide1", "0", 0, 0.1, 0.1, 3, "", {}, 0, 0, 0, 0)
@@ -36,3 +37,24 @@ def test_it_can_know_it_after_enough_measurements(later: list[int], known_s: flo
 def test_other_events_wait_for_nothing() -> None:
     loss = replace(CARRIED, kind="lost-inputs")
     assert noticeable_s(log_of(*[50] * 20), loss) == loss.from_s
+
+
+@pytest.mark.parametrize(
+    ("reason", "reports", "is_judged"),
+    [
+        ("biased", ENOUGH_REPORTS, True),
+        ("biased", ENOUGH_REPORTS - 1, False),
+        ("clock", 0, True),  # which what it sends does not end
+        ("", ENOUGH_REPORTS, False),
+    ],
+)
+def test_a_quarantine_should_be_over_if_enough_was_reported(
+    reason: str, reports: int, is_judged: bool
+) -> None:
+    trust = (Trust("guide2", reason), Trust("guide3"))
+    statuses = tuple(
+        (float(s), replace(STATUS, counts={"distrusted": 100 + reports * (s >= 50)}, trust=trust))
+        for s in range(61)
+    )
+    log = RunLog(0, {}, {"guide1": statuses}, (), {})
+    assert [t.peer for t in quarantines(log, "guide1", 60.0)] == ["guide2"] * is_judged

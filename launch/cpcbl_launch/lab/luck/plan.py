@@ -56,11 +56,10 @@ def history_of(seed: int, duration_s: float = DURATION_S) -> History:
     """The history of this seed. No event begins on a robot while another of its kind lasts."""
     dice, robots = Random(f"history {seed}"), tuple(team_of(seed).robots)
     last_s = duration_s - min(QUIET_S, duration_s / 2.0)
-    guides = tuple(name for name in robots if name.startswith("guide"))
     at_s, events = FIRST_S, list[Event]()
     while at_s < last_s - LASTS_S[0]:
         kind = dice.choices(list(WEIGHTS), list(WEIGHTS.values()))[0]
-        targets = {"guest": GUESTS, "dark": ("",), "kidnap": guides or ("",)}.get(kind, robots)
+        targets = {"guest": GUESTS, "dark": ("",)}.get(kind, robots)
         lasts_s = 0.0 if kind in INSTANT else dice.uniform(*LASTS_S)
         until_s = min(at_s + lasts_s, last_s)
         robot = dice.choice(targets)

@@ -16,10 +16,12 @@ from cpcbl_launch.lab.luck.violations import Violation
 from cpcbl_launch.reporting import metrics
 from cpcbl_launch.reporting.metrics import Samples
 from cpcbl_team.config import Team
+from cpcbl_transport.messages import Trust
 
 BACK_S = 12.0  # after the last event all robots are localized again,
 HELP_S = 15.0  # are helped again where they were before,
-TRUST_S = 20.0  # and trust each other
+TRUST_S = 20.0  # and trust each other,
+ENOUGH_REPORTS = 30  # if a teammate in quarantine reported so often in this time
 GAP_S = 0.4  # between two tracks, beside the time between two pieces of odometry
 FALSE_S, FALSE_M = 4.0, 0.5
 SETTLING_S = 10.0  # after an event of which no robot can know, its team is not judged
@@ -66,12 +68,21 @@ def _waiting(log: RunLog, history: History, team: Team) -> Iterator[Violation]:
             yield Violation("nobody waits", name, end_s, f"it was localized {text}")
         if quiet_s > HELP_S and _misses_help(log, name, end_s):
             yield Violation("nobody waits", name, end_s, f"no help for {HELP_S:g} s")
-        statuses = log.statuses.get(name, ())
-        if quiet_s > TRUST_S and statuses:
-            for trust in statuses[-1][1].trust:
-                if trust.reason and trust.peer in history.robots:
+        if quiet_s > TRUST_S:
+            for trust in quarantines(log, name, end_s):
+                if trust.peer in history.robots:
                     what = f"{trust.peer} is in quarantine ({trust.reason})"
                     yield Violation("nobody waits", name, end_s, what)
+
+
+def quarantines(log: RunLog, robot: str, end_s: float) -> list[Trust]:
+    """The quarantines of a robot's teammates that should be over. Only what a teammate reports can
+    end one: ten right reports, of which those of a belief that is not fresh are not tested."""
+    statuses = log.statuses.get(robot, ())
+    found = [t for t in statuses[-1][1].trust if t.reason] if statuses else []
+    refused = log.counts_between(robot, end_s - TRUST_S)["distrusted"]
+    enough = refused >= ENOUGH_REPORTS * sum(t.reason != "clock" for t in found)
+    return [t for t in found if t.reason == "clock" or enough]
 
 
 def _silent_until_s(history: History, team: Team) -> float:
