@@ -125,14 +125,19 @@ CONTRADICTION = "odometry and sightings contradict each other: another frame, un
 MANY_CASES, MANY = 12, 0.75
 
 
-def motion_cause(resightings: Sequence[Resighting], steps: Sequence[Step], tolerance: float) -> str:
+def motion_cause(
+    resightings: Sequence[Resighting],
+    steps: Sequence[Step],
+    as_it_came: Sequence[float],
+    tolerance: float,
+) -> str:
     """Which mistake explains the resightings; empty if the motion as it came does, or nothing does.
 
-    `tolerance`: how far off a landmark may be seen, as a share of its range.
+    `as_it_came`: the errors of that motion. `tolerance`: how far off a landmark may be seen, as a
+    share of its range.
     """
     if len(resightings) < LEAST_CASES:
         return ""
-    as_it_came = errors(resightings, steps, AS_IT_CAME)
     wrong = [i for i, error in enumerate(as_it_came) if error > tolerance]
     if len(wrong) < max(LEAST_CASES, 0.5 * len(resightings)):
         return ""
@@ -150,25 +155,27 @@ def motion_cause(resightings: Sequence[Resighting], steps: Sequence[Step], toler
     return ""
 
 
-def contradicts(resightings: Sequence[Resighting], steps: Sequence[Step], tolerance: float) -> bool:
-    """Whether landmarks are mostly seen where the motion says that they are not."""
-    if len(resightings) < MANY_CASES:
-        return False
-    far = errors(resightings, steps, AS_IT_CAME)
-    return sum(error > tolerance for error in far) > MANY * len(far)
+def contradicts(as_it_came: Sequence[float], tolerance: float) -> bool:
+    """Whether landmarks are mostly seen where the motion says that they are not, by its errors."""
+    far = [error for error in as_it_came if error > tolerance]
+    return len(as_it_came) >= MANY_CASES and len(far) > MANY * len(as_it_came)
 
 
 def errors(
-    resightings: Sequence[Resighting], steps: Sequence[Step], mistake: Mistake
+    resightings: Sequence[Resighting], steps: Sequence[Step], mistake: Mistake = AS_IT_CAME
 ) -> list[float]:
     """How far off each landmark is seen again, as a share of its range."""
+    if not resightings:
+        return []
     stamps, poses = _track(steps, mistake)
+    times_ns = {ns for r in resightings for ns in r[:2]}  # a frame has several landmarks
+    at = {ns: _pose_at(ns, stamps, poses) for ns in times_ns}
     found = []
-    for r in resightings:
-        a, b = (_pose_at(ns, stamps, poses) for ns in (r.since_ns, r.until_ns))
-        displacement = (b[0] - a[0]) * cmath.rect(1.0, -a[1]) * mistake.direction
-        expected = (r.before - displacement) * cmath.rect(1.0, a[1] - b[1])
-        found.append(abs(expected - r.after) / max(abs(r.before), abs(r.after), 1.0))
+    for since_ns, until_ns, before, after in resightings:
+        (a, h), (b, k) = at[since_ns], at[until_ns]
+        displacement = (b - a) * cmath.rect(1.0, -h) * mistake.direction
+        expected = (before - displacement) * cmath.rect(1.0, h - k)
+        found.append(abs(expected - after) / max(abs(before), abs(after), 1.0))
     return found
 
 
@@ -235,10 +242,11 @@ def poses_at(steps: Sequence[Step], times_ns: Sequence[int]) -> list[tuple[compl
 def _pose_at(
     stamp_ns: int, stamps: Sequence[int], poses: Sequence[tuple[complex, float]]
 ) -> tuple[complex, float]:
-    after = min(max(bisect_left(stamps, stamp_ns), 1), len(stamps) - 1)
-    (a, h), (b, k) = poses[after - 1], poses[after]
-    share = (stamp_ns - stamps[after - 1]) / ((stamps[after] - stamps[after - 1]) or 1)
-    share = min(max(share, 0.0), 1.0)
+    after = bisect_left(stamps, stamp_ns, 1, len(stamps) - 1)
+    (a, h), (b, k), since_ns = poses[after - 1], poses[after], stamps[after - 1]
+    share = (stamp_ns - since_ns) / ((stamps[after] - since_ns) or 1)
+    if not 0.0 <= share <= 1.0:
+        share = min(max(share, 0.0), 1.0)
     return a + share * (b - a), h + share * (k - h)
 
 
@@ -257,22 +265,24 @@ def resightings(
     begin_ns, end_ns = steps[0].stamp_ns, steps[-1].stamp_ns
     begun: dict[str, list[tuple[int, complex]]] = {}
     for frame in frames:
-        if not begin_ns <= frame.stamp_ns <= end_ns:
+        stamp_ns = frame.stamp_ns
+        if not begin_ns <= stamp_ns <= end_ns:
             continue
         for seen in frame.sightings:
             if seen.id not in names or (place := place_of(seen)) is None:
                 continue
             waiting = begun.setdefault(seen.id, [])
             for since_ns, before in waiting[:]:
-                gap_ns = frame.stamp_ns - since_ns
+                gap_ns = stamp_ns - since_ns
+                if gap_ns < least_ns:
+                    break  # those after it began later
                 if gap_ns >= most_ns or (
-                    gap_ns >= least_ns
-                    and abs(place - before) > NOTABLE * max(abs(place), abs(before))
+                    abs(place - before) > NOTABLE * max(abs(place), abs(before))
                 ):
-                    yield Resighting(since_ns, frame.stamp_ns, before, place)
+                    yield Resighting(since_ns, stamp_ns, before, place)
                     waiting.remove((since_ns, before))
-            if not waiting or frame.stamp_ns - waiting[-1][0] >= SPACING_NS:
-                waiting.append((frame.stamp_ns, place))
+            if not waiting or stamp_ns - waiting[-1][0] >= SPACING_NS:
+                waiting.append((stamp_ns, place))
 
 
 def place_of(seen: Sighting) -> complex | None:
@@ -313,7 +323,7 @@ def _area(corners: Sequence[complex]) -> float:
     """Twice the signed area of a triangle (m^2); 0 if it is nearly a line."""
     a, b, c = corners
     area = ((b - a).conjugate() * (c - a)).imag
-    longest = max(abs(p - q) for p, q in combinations(corners, 2))
+    longest = max(abs(b - a), abs(c - a), abs(c - b))
     return area if abs(area) > LEAST_AREA * longest**2 else 0.0
 
 

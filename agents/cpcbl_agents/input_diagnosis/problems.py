@@ -308,14 +308,15 @@ def _motion(
         return f"sightings: {mistakes.MIRRORED}"
     tolerance = 0.15 + 3.0 * math.hypot(sensor.range_share, sensor.bearing_sigma_rad)
     tolerance = min(tolerance, MOST_TOLERANCE)
-    resightings = list(motions.resightings(frames, steps, marks))
+    soon = list(motions.resightings(frames, steps, marks))
     is_right, cause = _shift_of_landmarks(facts, frames, steps)
-    cause = cause or motions.motion_cause(resightings, steps, tolerance)
+    cause = cause or motions.motion_cause(soon, steps, motions.errors(soon, steps), tolerance)
     if not cause:
         late = list(motions.resightings(frames, steps, marks, *motions.LATER_NS))
-        cause = motions.motion_cause(late, steps, tolerance)
-        is_whole = causes.covered_share(pieces, 1) >= LEAST_COVERED
-        if not cause and is_whole and motions.contradicts(late, steps, 1.5 * tolerance):
+        errors = motions.errors(late, steps)
+        cause = motions.motion_cause(late, steps, errors, tolerance)
+        is_contradicted = not cause and motions.contradicts(errors, 1.5 * tolerance)
+        if is_contradicted and causes.covered_share(pieces, 1) >= LEAST_COVERED:
             cause = causes.odometry_cause(pieces) or motions.CONTRADICTION
     if cause:
         is_order_right = right_order >= causes.LEAST_CASES and right_order > 4 * wrong_order
@@ -329,9 +330,7 @@ def _motion(
     if cause := _view_cause(facts, frames, steps, tolerance, is_right):
         return f"sightings: {cause}"
     spans_s = (steps[-1].stamp_ns - steps[0].from_ns) * 1e-9 if steps else math.inf
-    if resightings or (
-        spans_s < WAIT_S and any(s.id in marks for f in frames for s in f.sightings)
-    ):
+    if soon or (spans_s < WAIT_S and any(s.id in marks for f in frames for s in f.sightings)):
         return ""  # what landmarks show is known better, or soon
     cause = causes.odometry_cause(pieces)
     return cause and f"odometry: {cause}"

@@ -10,8 +10,9 @@ robot that moves little beside its sensor's errors, which no single pair of sigh
 
 import cmath
 import math
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from itertools import pairwise
+from itertools import accumulate, pairwise
 from statistics import fmean, median
 from typing import NamedTuple
 
@@ -264,27 +265,26 @@ def _drift_rad(steps: Sequence[Step], wheels: OdometryNoise) -> float:
 def _fitted(points: Sequence[Point], unsure: _Unsure) -> tuple[Shift, float, int] | None:
     """The shift by least squares with weights against outliers; how large the errors are as a
     multiple of what is due, and how many points are no outliers."""
-    weights, sums, terms = [p.weight for p in points], None, _terms(points)
-    roots = [math.sqrt(w) for w in weights]
-    scale, off = 1.0, list[float]()
-    for _ in range(ROUNDS):
-        sums = _sums(terms, weights)
-        if sums is None:
+    terms, of_points = _terms(points), [p.weight for p in points]
+    roots, weights = [math.sqrt(w) for w in of_points], of_points
+    for left in reversed(range(ROUNDS)):
+        if (found := _sums(terms, weights)) is None:
             return None
+        sums = found
         residuals = sums.residuals()
         off = [abs(r) * root for r, root in zip(residuals, roots, strict=True)]
         scale = max(median(off) / 1.18, 0.3)  # of a Rayleigh distribution
-        weights = [
-            p.weight / (1.0 + (far / (CUT * scale)) ** 4)
-            for p, far in zip(points, off, strict=True)
-        ]
-    if sums is None:
-        return None
+        if left:
+            cut = CUT * scale
+            both = zip(of_points, off, strict=True)
+            weights = [w / (1.0 + (far / cut) ** 4) for w, far in both]
     # Residuals of few points are smaller than the errors: the fit follows these
     free = 2 * len(points) - 2 * len({p.name for p in points}) - FITTED
     spread = scale * math.sqrt(2 * len(points) / max(free, 1))
-    inflation = max(spread, 1.0) ** 2 * _repetition(points, sums.residuals(), unsure)
-    return sums.shift(inflation, unsure.drift_rad), scale, sum(far < CUT * scale for far in off)
+    inflation = max(spread, 1.0) ** 2 * _repetition(points, residuals, unsure)
+    of_drift = unsure.drift_rad * _of_drift(points, terms, weights, sums.x)
+    shift = sums.shift(inflation, of_drift)
+    return shift, scale, sum(far < CUT * scale for far in off)
 
 
 def _repetition(points: Sequence[Point], residuals: Sequence[complex], unsure: _Unsure) -> float:
@@ -316,7 +316,6 @@ class _Sums(NamedTuple):
     xz: complex
     xq: complex
     zq: float
-    xd: complex  # with d = i q times the progress: a heading that drifts by one in all that time
     most_turn_rad: float
 
     @property
@@ -333,11 +332,12 @@ class _Sums(NamedTuple):
         g, e = self.solved()
         return [b + g * a - e * c for a, b, c in zip(self.x, self.q, self.z, strict=True)]
 
-    def shift(self, inflation: float, drift_rad: float) -> Shift:
-        """What was found; `inflation`: of all variances."""
+    def shift(self, inflation: float, of_drift: complex) -> Shift:
+        """What was found; `inflation`: of all variances, `of_drift`: Σ w x* d for d = what a
+        drift of the heading shifts."""
         g, e = self.solved()
         sigma = math.sqrt(inflation / self._of_turn)
-        along = sigma * self.xz / self.xx, drift_rad * self.xd / self.xx
+        along = sigma * self.xz / self.xx, of_drift / self.xx
         return Shift(g, 1.0 - e, sigma, inflation / self.xx, along, self.most_turn_rad)
 
 
@@ -347,27 +347,25 @@ class _Terms(NamedTuple):
     q: Sequence[complex]
     x: Sequence[complex]
     z: Sequence[complex]
-    d: Sequence[complex]  # i q times the progress
-    of_landmarks: Sequence[Sequence[int]]  # which points are of the same one
+    of_landmarks: Sequence[slice]  # which points are of the same one
     most_turn_rad: float
 
 
 def _terms(points: Sequence[Point]) -> _Terms:
     middle = median(p.heading for p in points)
-    names = dict.fromkeys(p.name for p in points)
+    ends = [*accumulate(Counter(p.name for p in points).values(), initial=0)]
     return _Terms(
         q=[p.place for p in points],
         x=[p.robot for p in points],
         z=[1j * (p.heading - middle) * p.place for p in points],
-        d=[1j * p.progress * p.place for p in points],
-        of_landmarks=[[i for i, p in enumerate(points) if p.name == n] for n in names],
+        of_landmarks=[slice(begin, end) for begin, end in pairwise(ends)],
         most_turn_rad=max(abs(p.heading - middle) for p in points),
     )
 
 
 def _sums(terms: _Terms, weights: Sequence[float]) -> _Sums | None:
     """None if the robot did not drive."""
-    q, x, z, d = (_centred(v, weights, terms.of_landmarks) for v in terms[:4])
+    q, x, z = (_centred(values, weights, terms.of_landmarks) for values in terms[:3])
     xx = sum([w * abs(a) ** 2 for w, a in zip(weights, x, strict=True)])
     if xx <= 0.0:
         return None
@@ -375,19 +373,26 @@ def _sums(terms: _Terms, weights: Sequence[float]) -> _Sums | None:
     wx = [w * a.conjugate() for w, a in zip(weights, x, strict=True)]
     xz = sum([a * c for a, c in zip(wx, z, strict=True)], 0j)
     xq = sum([a * b for a, b in zip(wx, q, strict=True)], 0j)
-    xd = sum([a * c for a, c in zip(wx, d, strict=True)], 0j)
     zq = sum([(w * c.conjugate() * b).real for w, c, b in zip(weights, z, q, strict=True)])
-    return _Sums(q, x, z, xx, zz, xz, xq, zq, xd, terms.most_turn_rad)
+    return _Sums(q, x, z, xx, zz, xz, xq, zq, terms.most_turn_rad)
 
 
 def _centred(
-    values: Sequence[complex], weights: Sequence[float], of_landmarks: Sequence[Sequence[int]]
+    values: Sequence[complex], weights: Sequence[float], of_landmarks: Sequence[slice]
 ) -> list[complex]:
     """The values, each less the weighted mean of its landmark."""
-    centred = list(values)
-    for own in of_landmarks:
-        total = sum([weights[i] for i in own])
-        mean = sum([weights[i] * values[i] for i in own], 0j) / total
-        for i in own:
-            centred[i] -= mean
+    centred = list[complex]()
+    for one in of_landmarks:
+        own, heavy = values[one], weights[one]
+        mean = sum([w * v for w, v in zip(heavy, own, strict=True)], 0j) / sum(heavy)
+        centred += [v - mean for v in own]
     return centred
+
+
+def _of_drift(
+    points: Sequence[Point], terms: _Terms, weights: Sequence[float], x: Sequence[complex]
+) -> complex:
+    """Σ w x* d with d = i q times the progress: what a heading shifts that drifts by one radian in
+    all that time."""
+    d = _centred([1j * p.progress * p.place for p in points], weights, terms.of_landmarks)
+    return sum([w * a.conjugate() * c for w, a, c in zip(weights, x, d, strict=True)], 0j)
