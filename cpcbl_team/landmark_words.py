@@ -50,29 +50,40 @@ class LandmarkWords:
         still."""
         if told.landmark not in self._unsurveyed or not self._passive:
             return state
-        state, common = with_landmark(state, told), self._common
-        if common is None or state.lost or not common.has_found(state, told.landmark):
+        state = with_landmark(state, told)
+        found = self._compared(state, told)
+        if found is None:
             return state
-        covariance = self._screen.cautious(state, told.robot, Covariance2(*told.covariance))
-        nis = common.word_nis(state, told, covariance)
+        covariance, nis = found
         state, is_trusted = self._screen.screen_word(state, told, nis)
         if not is_trusted:
             return state
-        if nis > self._gate:
-            return state.counted("landmark_gated")
-        return common.with_word(state, told, covariance)
+        return self._merged(state, told, covariance, nis, "landmark_gated")
 
-    def seen(self, state: State, name: str) -> State:
-        """The state when it sees this landmark: after the word on it once more, now and then."""
+    def after_sighting(self, state: State, name: str) -> State:
+        """The state when it sees this landmark: the word on it is merged again, now and then."""
         told = state.memory.teammates.landmarks.get(name)
         if told is None or state.stamp_ns // AGAIN_NS == state.updates.accepted_ns // AGAIN_NS:
             return state
-        common = self._common
-        if common is None or state.lost or not common.has_found(state, name):
-            return state
         if name not in state.memory.teammates.trusted_landmarks:
             return state
+        found = self._compared(state, told)
+        return state if found is None else self._merged(state, told, *found)
+
+    def _compared(self, state: State, told: LandmarkBelief) -> tuple[Covariance2, float] | None:
+        """The covariance of a word (m^2) and its normalized innovation squared beside the place
+        that the robot has found; None where it has none, or is lost."""
+        common = self._common
+        if common is None or state.lost or not common.has_found(state, told.landmark):
+            return None
         covariance = self._screen.cautious(state, told.robot, Covariance2(*told.covariance))
-        if common.word_nis(state, told, covariance) > self._gate:
-            return state
-        return common.with_word(state, told, covariance)
+        return covariance, common.word_nis(state, told, covariance)
+
+    def _merged(
+        self, state: State, told: LandmarkBelief, covariance: Covariance2, nis: float, *count: str
+    ) -> State:
+        """The state with a word, or in which it is counted that the gate has rejected it."""
+        if nis > self._gate:
+            return state.counted(*count)
+        assert self._common is not None
+        return self._common.with_word(state, told, covariance)

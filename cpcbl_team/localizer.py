@@ -199,8 +199,7 @@ class Localizer:
     ) -> tuple[State, list[Measurement], list[str]]:
         """The state that estimates the places of what is seen, the usable ones of these sightings,
         and the faults of those that have one."""
-        mates, pose = state.memory.teammates, state.estimate.pose
-        told = self.words.usable(state)
+        mates, told = state.memory.teammates, self.words.usable(state)
         measured: list[Measurement] = []
         faults: list[str] = []
         calibration = state.memory.calibration
@@ -212,13 +211,14 @@ class Localizer:
                 faults.append(fault)
                 continue
             if self._common is not None:
-                state = self.words.seen(self._common.with_object(state, sighting.id), sighting.id)
+                state = self._common.with_object(state, sighting.id)
+                state = self.words.after_sighting(state, sighting.id)
                 sighting = self._common.corrected(state, sighting)
                 if sighting.id not in told and self._common.has_no_place(state, sighting.id):
                     state = self._common.with_reading(state, sighting, now_ns)
                     continue
             known = mates.beliefs, self.settings, state.common_errors, told
-            m = measurement_of(sighting, now_ns, pose, self.field, *known)
+            m = measurement_of(sighting, now_ns, state.estimate.pose, self.field, *known)
             if m is not None:
                 m = m.corrected(bias, adaptation.ranges) if is_wrong else m
                 measured.append(m if factor == 1.0 else m.inflated(factor))
