@@ -10,6 +10,7 @@ from cpcbl_launch.team.checks import problems, warnings
 from cpcbl_team.config import (
     Field,
     Landmark,
+    LandmarkPosition,
     LocalizerSettings,
     RobotSettings,
     Start,
@@ -87,10 +88,33 @@ def test_the_simulated_field_must_know_where_everything_stands() -> None:
     assert true_map(team, 1).walls == {"w": Wall(from_m=(0.0, 0.0), to_m=(6.0, 0.0))}
 
 
+def test_what_one_robot_knows_is_about_unsurveyed_landmarks() -> None:
+    known = {"bax": LandmarkPosition(x_m=1.0, y_m=2.0)}
+    unsurveyed = {"box": Unsurveyed()}
+    (line,) = problems(team_of(replace(ROBOT, known_landmarks=known), unsurveyed=unsurveyed))
+    assert line == "robots.r1.known_landmarks.bax: map.unsurveyed has no 'bax'; write box"
+    odd = {"box": LandmarkPosition(x_m=1.0, y_m=2.0, covariance_m2=(0.01, 0.02, 0.01))}
+    (line,) = problems(team_of(replace(ROBOT, known_landmarks=odd), unsurveyed=unsurveyed))
+    assert line.startswith("robots.r1.known_landmarks.box.covariance_m2: [0.01, 0.02, 0.01]")
+
+
+def test_the_map_of_a_robot_holds_what_it_alone_knows() -> None:
+    known = {"box": LandmarkPosition(x_m=1.0, y_m=2.0, sigma_m=0.1)}
+    unsurveyed = {"box": Unsurveyed(gives="bearing"), "cone": Unsurveyed()}
+    team = team_of(replace(ROBOT, known_landmarks=known), unsurveyed=unsurveyed)
+    own = team.map_of("r1")
+    box = Landmark(x_m=1.0, y_m=2.0, sigma_m=0.1, gives="bearing")
+    assert own.landmarks == CORNERS | {"box": box}
+    assert own.unsurveyed == {"cone": Unsurveyed()}
+    assert own.names == team.map.names
+
+
 def test_only_joint_finds_landmarks() -> None:
     oval = replace(ROBOT, localizer=LocalizerSettings(variant="oval"))
     (line,) = warnings(team_of(oval, unsurveyed={"box": Unsurveyed()}))
     assert line.startswith("robots.r1.localizer.variant: oval does not find landmarks")
+    known = replace(oval, known_landmarks={"box": LandmarkPosition(x_m=1.0, y_m=2.0)})
+    assert list(warnings(team_of(known, unsurveyed={"box": Unsurveyed()}))) == []
     assert list(warnings(team_of(unsurveyed={"box": Unsurveyed()}))) == []
 
 
