@@ -52,7 +52,16 @@ _MODULES = (
         f"cpcbl_agents.{name}"
         for name in (
             *("agent", "clocks", "collaboration", "declarations", "filtering", "guests"),
-            *("input_diagnosis.", "load", "node", "pose_output", "robot", "sensing"),
+            *(
+                "input_diagnosis.",
+                "landmark_sharing",
+                "load",
+                "message_counters",
+                "node",
+                "pose_output",
+                "robot",
+                "sensing",
+            ),
             *("vision.camera_check", "vision.camera_correction", "waypoint_follower"),
         )
     ),
