@@ -1,6 +1,7 @@
 """Places of landmarks travel from the robots that know them to those that see them."""
 
 import math
+from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -10,7 +11,10 @@ from hypothesis import strategies as st
 from support.buses import SECOND, TeamOnBus, examples, robot_at, saw, team_of
 from support.wired_team import repeat_until, seen_between, wired
 
+from cpcbl_agents.flight_recorder.entries import MessageTaken, Put
 from cpcbl_agents.landmark_sharing import UNKNOWN_TIER, LandmarkSharing, landmark_tier
+from cpcbl_launch.recordings.read import read_run
+from cpcbl_launch.recordings.replay import replay_run
 from cpcbl_team.config import (
     BudgetSettings,
     CollaborationSettings,
@@ -169,6 +173,22 @@ def test_a_word_on_what_is_no_landmark_of_the_team_is_counted() -> None:
     counts = stand.nodes["me"].counts + stand.robots["me"].counts
     assert counts["own_message"] == 1
     assert stand.robots["me"].filter.places == ()
+
+
+def test_a_recorded_exchange_of_places_is_had_again_to_the_bit(tmp_path: Path) -> None:
+    stand = TeamOnBus(team(), record=tmp_path)
+    for name in HERE:
+        stand.ear(topics.TRACK.at(robot=name))
+    look(stand, seconds=6.0)
+    stand.recorders.close()
+    result = replay_run(read_run(tmp_path))
+    assert result.is_equal
+    assert len(result.processes) == len(HERE)
+    steps = [step for p in read_run(tmp_path).processes_of(()) for step in p.steps()]
+    entries = [entry for step in steps for entry in step.entries]
+    put = [e for e in entries if isinstance(e, Put) and e.key.startswith("landmark/")]
+    taken = [e for e in entries if isinstance(e, MessageTaken) and e.key.startswith("landmark/")]
+    assert len(put) == len(taken) == len(PLACES)
 
 
 @examples(50)
