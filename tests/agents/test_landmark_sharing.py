@@ -39,7 +39,7 @@ def team(guide: dict[str, Any] | None = None, me: dict[str, Any] | None = None) 
     """`guide` knows three landmarks that are not on the map; `me` does not, nor its own pose."""
     robots = {name: robot_at(*place, sigma_m=0.05) for name, place in HERE.items()}
     changes: dict[str, dict[str, Any]] = {
-        "guide": {"known_landmarks": KNOWN, **(guide or {})},
+        "guide": {"known_landmarks": KNOWN} if guide is None else guide,
         "me": {"start": None} if me is None else me,
     }
     field = Field(unsurveyed=dict.fromkeys(PLACES, Unsurveyed()))
@@ -79,6 +79,18 @@ def test_a_robot_without_map_and_start_gets_the_map_from_one_that_has_it() -> No
     assert not latest.lost
     assert math.dist(latest.estimate.pose[:2], HERE["me"]) < 0.05
     assert {place.landmark for place in stand.robots["me"].filter.places} == set(PLACES)
+
+
+def test_a_team_without_a_map_finds_itself_in_the_frame_of_one_robot() -> None:
+    """The frame of `guide`: it begins in its origin, and finds the landmarks itself."""
+    origin = Start(x_m=0.0, y_m=0.0, sigma_m=0.0, heading_sigma_deg=0.0)
+    stand = TeamOnBus(team(guide={"start": origin}))
+    look(stand, seconds=6.0)
+    assert {place.landmark for place in stand.robots["guide"].filter.places} == set(PLACES)
+    latest = stand.robots["me"].collaboration.latest
+    assert latest is not None
+    assert not latest.lost
+    assert math.dist(latest.estimate.pose[:2], HERE["me"]) < 0.05
 
 
 def test_each_place_is_told_once_and_then_nothing_is_asked_for() -> None:
@@ -138,7 +150,7 @@ def test_without_unsurveyed_landmarks_nothing_is_declared() -> None:
 @pytest.mark.parametrize("rules", [{"passive": False}, {"after_s": 60.0}], ids=str)
 def test_without_collaboration_no_place_is_told(rules: dict[str, Any]) -> None:
     settings = {"collaboration": CollaborationSettings(**rules)}
-    stand = TeamOnBus(team(guide=settings))
+    stand = TeamOnBus(team(guide={"known_landmarks": KNOWN, **settings}))
     look(stand, seconds=5.0)
     assert words(stand, "guide") == []
 
@@ -152,7 +164,8 @@ def test_a_lost_robot_tells_no_place_that_it_found() -> None:
 
 def test_the_budget_holds_for_places_too() -> None:
     budget = BudgetSettings(messages_per_minute=2.0)
-    stand = TeamOnBus(team(guide={"collaboration": CollaborationSettings(budget=budget)}))
+    settings = {"collaboration": CollaborationSettings(budget=budget)}
+    stand = TeamOnBus(team(guide={"known_landmarks": KNOWN, **settings}))
     ear = stand.ear("landmark/**")  # somebody who never has enough
     look(stand, "guide", seconds=30.0)
     (flow,) = words(stand, "guide")
