@@ -180,6 +180,7 @@ WAYS = {
         SIMULATED, "trial", "--duration 3"
     ),
     "cpcbl-team up team.toml": LIVE._replace(says=ALIVE),
+    "cpcbl-team up unmapped": LIVE._replace(says=ALIVE),
     "cpcbl-team up team.toml --duration 120 --record run.mcap": Way(SIMULATED, "trial", SHORT),
     "cpcbl-team what-if run": Way("worth", "trial", "--duration 1", shows=LEDGER),
     "cpcbl-team what-if run --without r3": Way("apart", more="--duration 1 --jobs 1"),

@@ -30,7 +30,12 @@ from cpcbl_launch.run.observer import ObserverReport
 from cpcbl_launch.run.processes import ROBOT, Processes
 from cpcbl_launch.views.live import LiveView
 from cpcbl_launch.views.own_figures import own_figures_table
-from cpcbl_launch.views.traffic_tables import COLUMNS_EXPLAINED, help_traffic_table, limits_text
+from cpcbl_launch.views.traffic_tables import (
+    COLUMNS_EXPLAINED,
+    help_traffic_table,
+    kinds_text,
+    limits_text,
+)
 from cpcbl_team.tiers import LOWEST_TIER
 from cpcbl_transport.messages import Track
 
@@ -248,7 +253,7 @@ def _remarks(report: Report, is_wide: bool) -> Iterator[str]:
     if report.alone and is_wide:
         yield "Column before is the RMSE before teammates began to help, the others since then."
     if is_wide:
-        yield "Columns out and B count fixes and beliefs that were sent, and their bytes."
+        yield f"Columns out and B count {kinds_text(report)} that were sent, and their bytes."
     yield "For reference: a consistent filter has 98.9 % in 3 σ and a NEES of 2."
     team = report.team
     if team.pooled_rmse_m is not None:

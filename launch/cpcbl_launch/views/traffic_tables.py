@@ -17,7 +17,8 @@ from cpcbl_launch.reporting.tables import number, short, table
 from cpcbl_launch.views.live import LiveView
 from cpcbl_launch.views.traffic import RATES_NS, HelpLink, LiveRobot, Traffic
 
-COLOURS = {"fix": "cyan", "belief": "magenta"}
+COLOURS = {"fix": "cyan", "belief": "magenta", "landmark": "green"}
+HEADS = {"fix": "fixes", "belief": "beliefs", "landmark": "places"}
 NOT_SENT = {"budget": "over_budget", "value": "worthless", "silence": "silent"}
 COLUMNS_EXPLAINED = (
     "Messages were not sent because the budget was spent (column budget), they were\n"
@@ -38,32 +39,48 @@ _LIVE_EXPLAINED = (
 def help_traffic_table(report: Report) -> Table:
     """What each robot sent, what it did not send and why, and how near it came to its limits."""
     robots = list(report.robots.values())
-    shown = table(
-        "fixes and beliefs sent, and not sent", ("robot",), ("fixes", "beliefs", "B/s", *NOT_SENT)
-    )
+    topics = _topics(report)
+    title, heads = f"{kinds_text(report)} sent, and not sent", [HEADS[topic] for topic in topics]
+    shown = table(title, ("robot",), (*heads, "B/s", *NOT_SENT))
     if any(robot.spending for robot in robots):
         shown.add_column("most", no_wrap=True)
     for name, robot in report.robots.items():
-        _add_traffic_row(shown, name, robot, report.duration_s)
+        _add_traffic_row(shown, name, robot, report.duration_s, topics)
     shown.add_section()
-    shown.add_row("team", *_traffic_cells(robots, report.duration_s), style="bold")
+    shown.add_row("team", *_traffic_cells(robots, report.duration_s, topics), style="bold")
     if report.guests:
         shown.add_section()
     for name, guest in report.guests.items():
-        _add_traffic_row(shown, f"{name}, guest", guest, report.duration_s)
+        _add_traffic_row(shown, f"{name}, guest", guest, report.duration_s, topics)
     return shown
 
 
-def _add_traffic_row(shown: Table, name: str, robot: RobotReport, duration_s: float) -> None:
+def kinds_text(report: Report) -> str:
+    """The kinds of help in words, those of landmarks only where any was sent."""
+    *first, last = (HEADS[topic] for topic in _topics(report))
+    return f"{', '.join(first)} and {last}"
+
+
+def _topics(report: Report) -> list[str]:
+    """The topics of help to tell of: places of landmarks only where any was sent."""
+    sent = {flow.topic for robot in report.robots.values() for flow in robot.sent}
+    return [topic for topic in HEADS if topic != "landmark" or topic in sent]
+
+
+def _add_traffic_row(
+    shown: Table, name: str, robot: RobotReport, duration_s: float, topics: Sequence[str]
+) -> None:
     limits = [Text("\n").join(map(limit_text, robot.spending))] if robot.spending else []
-    shown.add_row(name, *_traffic_cells([robot], duration_s), *limits)
+    shown.add_row(name, *_traffic_cells([robot], duration_s, topics), *limits)
 
 
-def _traffic_cells(robots: Sequence[RobotReport], duration_s: float) -> list[str]:
+def _traffic_cells(
+    robots: Sequence[RobotReport], duration_s: float, topics: Sequence[str]
+) -> list[str]:
     flows = [flow for robot in robots for flow in robot.sent]
     per_s = sum(f.bytes for f in flows) / duration_s if duration_s else None
     return [
-        *(short(sum(f.messages for f in flows if f.topic == topic)) for topic in COLOURS),
+        *(short(sum(f.messages for f in flows if f.topic == topic)) for topic in topics),
         "-" if per_s is None else short(per_s),
         *_not_sent(flows),
     ]

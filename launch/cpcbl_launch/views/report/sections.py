@@ -43,11 +43,12 @@ HELP_ABOUT = (
     " their readers do."
 )
 TRAFFIC_ABOUT = (
-    "Fixes and beliefs that each robot sent: bytes on its link, with Zenoh's own, without those of"
+    "What each robot sent: bytes on its link, with Zenoh's own, without those of"
     " TCP/IP. A limit's bar is the most that was spent within one window."
 )
 REFUSED_ABOUT = "Inputs and messages that robots could not use, by reason."
 SETTINGS_ABOUT = "The team file as the robots had it, without what has its default."
+HELP_KINDS = {"fix": "fixes", "belief": "beliefs", "landmark": "places of landmarks"}
 MOST_CHARTS, MOST_MATRIX, MOST_EVENTS = 24, 40, 300
 
 
@@ -222,7 +223,7 @@ def traffic_section(shown: RunView) -> str:
     duration_s = max(shown.run.duration_s, 1e-9)
     rows = []
     for name, robot in shown.reports.items():
-        of_robot = {topic: kinds.get(name, {}).get(topic, Counter()) for topic in ("fix", "belief")}
+        of_robot = {topic: kinds.get(name, {}).get(topic, Counter()) for topic in HELP_KINDS}
         parts = [
             (topic, float(c["bytes"]), f"{topic}: {c['messages']} messages, {c['bytes']} bytes")
             for topic, c in of_robot.items()
@@ -230,12 +231,14 @@ def traffic_section(shown: RunView) -> str:
         left = Counter[str]()
         for counts in of_robot.values():
             left.update(counts)
-        cells = [str(of_robot["fix"]["messages"]), str(of_robot["belief"]["messages"])]
+        cells = [str(counts["messages"]) for counts in of_robot.values()]
         cells += [short(robot.bytes_sent), f"{robot.bytes_sent / duration_s:.1f}"]
         cells += [short(left[reason]) for reason in ("over_budget", "worthless", "silent")]
         rows.append(_row(name, cells, after=f"<td>{bar(parts, float(most))}</td>"))
-    head = ["robot", "fixes", "beliefs", "bytes", "B/s", "over budget", "worthless", "silent", ""]
-    key = '<p class="key soft">bytes of<i class="fix"></i>fixes<i class="belief"></i>beliefs</p>'
+    head = ["robot", *HELP_KINDS.values(), "bytes", "B/s"]
+    head += ["over budget", "worthless", "silent", ""]
+    colours = (f'<i class="{topic}"></i>{text}' for topic, text in HELP_KINDS.items())
+    key = f'<p class="key soft">bytes of{"".join(colours)}</p>'
     limits = list(_limit_rows(shown))
     budget = _table(["robot", "limit", "most", "allowed", ""], limits) if limits else ""
     none = "" if limits else '<p class="soft">No robot has a limit.</p>'
