@@ -174,13 +174,13 @@ def updated_by_teammate(
     return estimate._replace(shared=estimate.covariance), common
 
 
-def updated_by_word(
-    prior: Estimate, common: CommonErrors, word: Observation, number: int, splits: bool
+def updated_by_landmark_belief(
+    prior: Estimate, common: CommonErrors, observation: Observation, number: int, splits: bool
 ) -> tuple[Estimate, CommonErrors] | None:
-    """After a teammate's word on a place, whose first parameter is this; None where it makes the
-    pose no better. By covariance intersection of all that is estimated: the word may have come from
-    what this robot once said. So a camera of uncertain errors would seem to know less of them after
-    each word; a robot with one takes no word."""
+    """After a teammate's observation of a place, whose first parameter is this; None where it makes
+    the pose no better. By covariance intersection of all that is estimated: what the teammate knows
+    may have come from this robot. So less would be known of the errors of a camera after each;
+    where these are uncertain it is not used."""
     if any(common.camera_covariance):
         return None
     sensitivities: tuple[Sensitivity, ...] = (((number, 1.0),), ((number + 1, 1.0),))
@@ -189,8 +189,8 @@ def updated_by_word(
     def attempt(weight: float, inflation: float) -> AugmentedUpdate:
         wider = common._replace(parameters=common.parameters.inflated(inflation))
         update = AugmentedUpdate(prior.covariance.scaled(inflation), wider, estimated)
-        noise = word.noise(1.0 / (1.0 - weight))
-        return update.after(independent_readings(word, noise, sensitivities))
+        noise = observation.noise(1.0 / (1.0 - weight))
+        return update.after(independent_readings(observation, noise, sensitivities))
 
     if prior.shared is ZERO3 or not splits:  # nothing of it came from teammates, or went to them
         update = attempt(0.0, 1.0)

@@ -9,8 +9,8 @@ from cpcbl_team.augmented_update import (
     Reading,
     independent_readings,
     updated,
+    updated_by_landmark_belief,
     updated_by_teammate,
-    updated_by_word,
 )
 from cpcbl_team.common_errors import CommonErrors
 from cpcbl_team.config import CameraSettings, Field, LocalizationSettings
@@ -199,27 +199,31 @@ class CommonErrorFilter:
             )
         return with_common_errors(state, common), estimate
 
-    def word_nis(self, state: State, told: LandmarkBelief, covariance: Covariance2) -> float:
-        """The normalized innovation squared of a teammate's word on a place that the robot has
-        found: chi-square of two degrees of freedom. `covariance`: of the word (m^2)."""
+    def landmark_belief_nis(
+        self, state: State, belief: LandmarkBelief, covariance: Covariance2
+    ) -> float:
+        """The normalized innovation squared of a teammate's belief about a place that the robot has
+        found: chi-square of two degrees of freedom. `covariance`: of the belief (m^2)."""
         common = state.common_errors
         assert common is not None
-        x, y = common.place_error(told.landmark)
-        total = common.place_covariance(told.landmark) + covariance
-        return total.mahalanobis_squared(told.x_m - x, told.y_m - y)
+        x, y = common.place_error(belief.landmark)
+        total = common.place_covariance(belief.landmark) + covariance
+        return total.mahalanobis_squared(belief.x_m - x, belief.y_m - y)
 
-    def with_word(self, state: State, told: LandmarkBelief, covariance: Covariance2) -> State:
-        """The state after a teammate's word on a place that the robot has found, by covariance
+    def with_landmark_belief(
+        self, state: State, belief: LandmarkBelief, covariance: Covariance2
+    ) -> State:
+        """The state after a teammate's belief about a place that the robot has found, by covariance
         intersection of all that it estimates; unchanged where that makes the pose no better."""
         common, prior = state.common_errors, state.estimate
         assert common is not None
-        place = common.place_covariance(told.landmark)
+        place = common.place_covariance(belief.landmark)
         if covariance.xx + covariance.yy >= place.xx + place.yy:
             return state
-        x, y = common.place_error(told.landmark)
-        number, residuals = common.objects[told.landmark], (told.x_m - x, told.y_m - y)
-        word = Observation((ZERO_ROW, ZERO_ROW), residuals, EXACT, covariance)
-        after = updated_by_word(prior, common, word, number, self._splits)
+        x, y = common.place_error(belief.landmark)
+        number, residuals = common.objects[belief.landmark], (belief.x_m - x, belief.y_m - y)
+        observation = Observation((ZERO_ROW, ZERO_ROW), residuals, EXACT, covariance)
+        after = updated_by_landmark_belief(prior, common, observation, number, self._splits)
         if after is None:
             return state
         estimate, common = after

@@ -26,7 +26,7 @@ from cpcbl_team.inputs import (
     Sighting,
     Sightings,
 )
-from cpcbl_team.landmark_words import LandmarkWords
+from cpcbl_team.landmark_beliefs import LandmarkBeliefs
 from cpcbl_team.landmarks import Landmarks, LandmarkUpdate
 from cpcbl_team.measurements import (
     BELIEF_VALID_BEFORE_NS,
@@ -102,7 +102,7 @@ class Localizer:
         self._stationary = StationaryCheck(settings, self._variant.reduce, has_common)
         self.recovery = Recovery(settings, field, self._landmarks, self._variant.reduce)
         self.screen = TeammateScreen(settings, gates, self._variant.is_probabilistic, team)
-        self.words = LandmarkWords(settings, field, self._common, self.screen)
+        self.landmark_beliefs = LandmarkBeliefs(settings, field, self._common, self.screen)
 
     def cycle(self, state: State, frame: Sightings) -> State:
         """One cycle (paper, section 3, figure 1). Pure: the same inputs give the same bits.
@@ -199,7 +199,7 @@ class Localizer:
     ) -> tuple[State, list[Measurement], list[str]]:
         """The state that estimates the places of what is seen, the usable ones of these sightings,
         and the faults of those that have one."""
-        mates, told = state.memory.teammates, self.words.usable(state)
+        mates, believed = state.memory.teammates, self.landmark_beliefs.usable(state)
         measured: list[Measurement] = []
         faults: list[str] = []
         calibration = state.memory.calibration
@@ -212,12 +212,12 @@ class Localizer:
                 continue
             if self._common is not None:
                 state = self._common.with_object(state, sighting.id)
-                state = self.words.after_sighting(state, sighting.id)
+                state = self.landmark_beliefs.after_sighting(state, sighting.id)
                 sighting = self._common.corrected(state, sighting)
-                if sighting.id not in told and self._common.has_no_place(state, sighting.id):
+                if sighting.id not in believed and self._common.has_no_place(state, sighting.id):
                     state = self._common.with_reading(state, sighting, now_ns)
                     continue
-            known = mates.beliefs, self.settings, state.common_errors, told
+            known = mates.beliefs, self.settings, state.common_errors, believed
             m = measurement_of(sighting, now_ns, state.estimate.pose, self.field, *known)
             if m is not None:
                 m = m.corrected(bias, adaptation.ranges) if is_wrong else m

@@ -99,7 +99,7 @@ class Measurement(msgspec.Struct, frozen=True, gc=False):
     is_estimated: bool = False
     """Whether the robot estimates the object's place with its own pose."""
     sender: str = ""
-    """The teammate whose word the position is; empty: the map's, or the robot's own."""
+    """The teammate whose belief the position is; empty: the map's, or the robot's own."""
 
     @property
     def is_dependent(self) -> bool:
@@ -160,12 +160,12 @@ def measurement_of(
     teammates: Mapping[str, tuple[Belief, ...]],
     settings: config.LocalizationSettings,
     common: CommonErrors | None = None,
-    told: Mapping[str, LandmarkBelief] = _NONE,
+    landmark_beliefs: Mapping[str, LandmarkBelief] = _NONE,
 ) -> Measurement | None:
     """The sighting, from about `pose`, with its object's position; None if that is not known.
-    `told`: as of `map_object`."""
+    `landmark_beliefs`: as of `map_object`."""
     name, is_for_heading, wall, gives = sighting.id, False, None, "both"
-    on_map, sender = map_object(field, name, common, told), name
+    on_map, sender = map_object(field, name, common, landmark_beliefs), name
     if on_map is not None:
         position, wall, gives, sender = on_map
     elif name in teammates and settings.collaboration.passive:

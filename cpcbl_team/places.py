@@ -32,29 +32,29 @@ class MapObject(NamedTuple):
     position: ObjectPosition  # of a wall: where it begins
     wall: Wall | None
     gives: Gives
-    sender: str = ""  # the teammate whose word its place is; empty: the map's, or the robot's own
+    sender: str = ""  # the teammate whose belief its place is; empty: the map's, or the robot's own
 
 
 def map_object(
     field: Field,
     name: str,
     common: CommonErrors | None = None,
-    told: Mapping[str, LandmarkBelief] = _NONE,
+    beliefs: Mapping[str, LandmarkBelief] = _NONE,
 ) -> MapObject | None:
     """The object of this name; None if its place is not known. `common`: of a robot that estimates
-    the places of objects with its pose. `told`: the places of unsurveyed landmarks as teammates say
-    them, for those that it does not estimate."""
+    the places of objects with its pose. `beliefs`: of teammates, about unsurveyed landmarks; they
+    count for those that it does not estimate."""
     is_estimated = common is not None and name in common.objects
     unsurveyed = field.unsurveyed.get(name)
     if unsurveyed is not None:
         if common is not None and is_estimated:
             position = ObjectPosition(*common.place_error(name), common.place_covariance(name))
             return MapObject(position, None, unsurveyed.gives)
-        word = told.get(name)
-        if word is None:
+        belief = beliefs.get(name)
+        if belief is None:
             return None
-        position = ObjectPosition(word.x_m, word.y_m, Covariance2(*word.covariance))
-        return MapObject(position, None, unsurveyed.gives, word.robot)
+        position = ObjectPosition(belief.x_m, belief.y_m, Covariance2(*belief.covariance))
+        return MapObject(position, None, unsurveyed.gives, belief.robot)
     landmark = field.landmarks.get(name)
     if landmark is not None:
         x, y, covariance = _point(landmark)

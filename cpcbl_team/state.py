@@ -152,7 +152,7 @@ class TeammateMemory(NamedTuple):
     beliefs: Mapping[str, tuple[Belief, ...]] = _NONE
     senders: Mapping[str, SenderRecord] = _NONE  # teammates, and the robot's own sensors
     last_report_ns: int = _NEVER_NS
-    landmarks: Mapping[str, LandmarkBelief] = _NONE  # the best word on each
+    landmarks: Mapping[str, LandmarkBelief] = _NONE  # the best belief about each
 
     @property
     def trusted_landmarks(self) -> Mapping[str, LandmarkBelief]:
@@ -160,7 +160,9 @@ class TeammateMemory(NamedTuple):
         if not self.landmarks:
             return self.landmarks
         in_quarantine = {name for name, record in self.senders.items() if record.reason}
-        return {n: told for n, told in self.landmarks.items() if told.robot not in in_quarantine}
+        return {
+            n: belief for n, belief in self.landmarks.items() if belief.robot not in in_quarantine
+        }
 
 
 class CalibrationMemory(NamedTuple):
@@ -228,7 +230,7 @@ class State(NamedTuple):
 
     @property
     def reported(self) -> Estimate:
-        """The estimate as it is told to others: as uncertain as the settings are, too."""
+        """The estimate as it is belief to others: as uncertain as the settings are, too."""
         return with_doubts(self.estimate, self.memory.calibration.check)
 
     @property
@@ -308,17 +310,17 @@ def with_belief(state: State, belief: Belief, now_ns: int, oldest_ns: int) -> St
     return with_teammates(state, memory)
 
 
-def with_landmark(state: State, told: LandmarkBelief) -> State:
-    """The state with a teammate's word on a landmark, if that is newer than its own last one, or
-    better than another's."""
+def with_landmark(state: State, belief: LandmarkBelief) -> State:
+    """The state with a teammate's belief about a landmark, if that is newer than its own last one,
+    or better than another's."""
     memory = state.memory.teammates
-    before = memory.landmarks.get(told.landmark)
-    if before is not None and before.robot != told.robot:
-        (xx, _, yy), (before_xx, _, before_yy) = told.covariance, before.covariance
+    before = memory.landmarks.get(belief.landmark)
+    if before is not None and before.robot != belief.robot:
+        (xx, _, yy), (before_xx, _, before_yy) = belief.covariance, before.covariance
         is_trusted = before.landmark in memory.trusted_landmarks
         if is_trusted and xx + yy >= before_xx + before_yy:
             return state
-    landmarks = {**memory.landmarks, told.landmark: told}
+    landmarks = {**memory.landmarks, belief.landmark: belief}
     return with_teammates(state, memory._replace(landmarks=landmarks))
 
 

@@ -145,15 +145,17 @@ class TeammateScreen:
             measurement=m, observation=observation_of(state.estimate, m, found.constraints)
         )
 
-    def screen_word(self, state: State, told: LandmarkBelief, nis: float) -> tuple[State, bool]:
-        """The state after a teammate's word on a landmark of which the robot knows the place, and
-        whether it may be used. `nis`: of the two places, chi-square of two degrees of freedom."""
+    def screen_landmark_belief(
+        self, state: State, belief: LandmarkBelief, nis: float
+    ) -> tuple[State, bool]:
+        """The state after a teammate's belief about a landmark of which the robot knows the place,
+        and whether it may be used. `nis`: of the two places, of two degrees of freedom."""
         if not self.is_active:
             return state, True
         memory = state.memory.teammates
         state = with_teammates(state, memory._replace(last_report_ns=state.stamp_ns))
-        report = TeammateReport(state.stamp_ns, nis, is_guest=self._is_guest(told.robot))
-        return self._assess(state, told.robot, report, told.landmark)
+        report = TeammateReport(state.stamp_ns, nis, is_guest=self._is_guest(belief.robot))
+        return self._assess(state, belief.robot, report, belief.landmark)
 
     def with_caution(self, state: State, observation: PoseObservation) -> PoseObservation:
         """A teammate's fix with what this robot adds to the observer's part of its covariance."""

@@ -38,7 +38,7 @@ _content = msgspec.msgpack.Encoder(enc_hook=float).encode
 _apply: dict[type, Callable[[Localizer, State, Input], State]] = {
     Belief: Localizer.add_teammate_belief,  # type: ignore[dict-item]
     HeadingBelief: Localizer.add_teammate_belief,  # type: ignore[dict-item]
-    LandmarkBelief: lambda localizer, state, told: localizer.words.add(state, told),  # type: ignore
+    LandmarkBelief: lambda localizer, state, belief: localizer.landmark_beliefs.add(state, belief),  # type: ignore
     InitialPose: Localizer.set_pose,  # type: ignore[dict-item]
     Sightings: Localizer.cycle,  # type: ignore[dict-item]
     Position: Localizer.add_position,  # type: ignore[dict-item]

@@ -126,7 +126,7 @@ class CollaborationAgent:
                 return self._fixes(message, now_ns)
             case agent.LandmarkPlaces():
                 self.landmarks.update(message.places)
-                return self._landmark_words(now_ns)
+                return self._landmark_beliefs(now_ns)
             case agent.LandmarkSubscribers(names):
                 self.landmarks.ask(names, now_ns)
             case agent.Presence(name, tier):
@@ -322,20 +322,20 @@ class CollaborationAgent:
 
     # Landmarks -----------------------------------------------------------------------------
 
-    def _landmark_words(self, now_ns: int) -> list[LandmarkBelief]:
+    def _landmark_beliefs(self, now_ns: int) -> list[LandmarkBelief]:
         """The place of a landmark that a teammate asks for, if the robot may tell it."""
         is_lost = self.latest is None or bool(self.latest.lost)
         may_tell = self.has_started and self._rules.passive and not (is_lost or self.may_mislead)
-        found = self.landmarks.next_word(now_ns) if may_tell else None
+        found = self.landmarks.next_belief(now_ns) if may_tell else None
         if found is None:
             return []
-        told, last_ns = found
+        belief, last_ns = found
         age_s = gains.UNKNOWN_AGE_S if last_ns == 0 else (now_ns - last_ns) * 1e-9
-        if not self._affords(now_ns, _size(told), age_s, urgent=False):
+        if not self._affords(now_ns, _size(belief), age_s, urgent=False):
             self.counters.of("landmark", "").over_budget += 1
             return []
-        self.landmarks.note_sent(told)
-        return [told]
+        self.landmarks.note_sent(belief)
+        return [belief]
 
     # Budget, and what was really sent ----------------------------------------------------
 

@@ -37,7 +37,7 @@ class Declarations:
         self._sources: frozenset[tuple[str, int]] = frozenset()
         self._neighbours: frozenset[str] = frozenset()
         self._landmarks: frozenset[tuple[str, int]] = frozenset()
-        self._told: frozenset[tuple[str, int]] = frozenset()
+        self._tiers_of_landmarks: frozenset[tuple[str, int]] = frozenset()
         self.tier: int | None = None
         """The tier that is announced."""
         self.announced = 0
@@ -87,16 +87,16 @@ class Declarations:
     def update_landmarks(self, tiers: Mapping[str, int]) -> frozenset[str]:
         """The landmarks whose places somebody asks for in these tiers. Publishers of others are
         taken back."""
-        told = frozenset(tiers.items())
-        for name, tier in self._told - told:
+        tiers_of_landmarks = frozenset(tiers.items())
+        for name, tier in self._tiers_of_landmarks - tiers_of_landmarks:
             publisher = self._publishers.pop(self._landmark_key(name, tier), None)
             if publisher is not None:
                 publisher.close()
-        self._told = told
+        self._tiers_of_landmarks = tiers_of_landmarks
         topic = topics.LANDMARK
         return frozenset(
             name
-            for name, tier in sorted(told)
+            for name, tier in sorted(tiers_of_landmarks)
             if self.publisher(topic, self._landmark_key(name, tier)).matching
         )
 

@@ -101,10 +101,10 @@ class FilterAgent:
         """The landmarks whose places the robot estimates beside its pose, or knows from
         teammates."""
         state = self.timeline.state
-        common, told = state.common_errors, state.memory.teammates.trusted_landmarks
+        common, beliefs = state.common_errors, state.memory.teammates.trusted_landmarks
         names = [] if common is None else [*common.objects]
-        names += [name for name in told if name not in names]
-        found = ((name, map_object(self._field, name, common, told)) for name in names)
+        names += [name for name in beliefs if name not in names]
+        found = ((name, map_object(self._field, name, common, beliefs)) for name in names)
         return tuple(
             LandmarkEstimate(name, p.position.x, p.position.y, p.position.covariance)
             for name, p in found
@@ -183,8 +183,8 @@ class FilterAgent:
         if not self._shared:
             return []
         state = self.timeline.state
-        common, told = state.common_errors, state.memory.teammates.trusted_landmarks
-        places = list(told.values())
+        common, beliefs = state.common_errors, state.memory.teammates.trusted_landmarks
+        places = list(beliefs.values())
         for name in self._shared:
             found = map_object(self._field, name, common)
             if found is not None:

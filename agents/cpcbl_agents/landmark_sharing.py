@@ -3,7 +3,7 @@
 A landmark that is not on the team's map has a tier, by the sigma of its place. A robot asks for the
 place of a landmark that it sees in better tiers than that of its own knowledge, and tells what it
 has found or known itself while somebody asks. Whoever has taken a place asks for better ones alone,
-so nothing is sent for long, and no robot's word comes back to it as a better one. Of many robots
+so nothing is sent for long, and no robot's belief comes back to it as a better one. Of many robots
 that know a place each waits another time before it tells it, so that the first ones suffice.
 """
 
@@ -15,11 +15,11 @@ from cpcbl_team.inputs import LandmarkBelief, Sightings
 from cpcbl_team.tiers import tier_of
 
 TIER_WIDTH: Final = 2.0  # ratio of the sigmas of two tiers
-UNKNOWN_TIER: Final = 8  # beyond 1.28 m a place is not told
+UNKNOWN_TIER: Final = 8  # beyond 1.28 m a place is not sent
 ROUNDING: Final = 1.01  # by which a sigma on the wire may be larger
 IN_SIGHT_NS: Final = 10_000_000_000  # a place is asked for so long after its landmark was seen
 SLOT_NS: Final = 50_000_000  # of waiting, a robot of the team
-REPEAT_NS: Final = 1_000_000_000  # between two words on a landmark of the same tier
+REPEAT_NS: Final = 1_000_000_000  # between two beliefs about a landmark of the same tier
 
 
 def landmark_tier(place: LandmarkBelief, rounding: float = 1.0) -> int:
@@ -37,7 +37,7 @@ class LandmarkSharing:
         self._robot, self._names = robot, names
         self._waits_ns = {name: _share(f"{name}/{robot}") * robots * SLOT_NS for name in names}
         self._seen_ns: dict[str, int] = {}
-        self._sent: dict[str, tuple[int, int]] = {}  # tier and time of the last word on each
+        self._sent: dict[str, tuple[int, int]] = {}  # tier and time of the last belief about each
         self._own: dict[str, LandmarkBelief] = {}
         self._known: dict[str, int] = {}  # the best tier in which each is known, by whomever
         self._asked_ns: dict[str, int] = {}
@@ -83,10 +83,10 @@ class LandmarkSharing:
             for tier in range(self._known.get(name, UNKNOWN_TIER))
         )
 
-    def next_word(self, now_ns: int) -> tuple[LandmarkBelief, int] | None:
-        """What is to be told next, if anything, and the time of the last word on it (0: none). The
-        most certain place comes first, then the one that waits longest. One at a time: routers drop
-        what follows too soon."""
+    def next_belief(self, now_ns: int) -> tuple[LandmarkBelief, int] | None:
+        """What is to be sent next, if anything, and the time of the last belief about it (0: none).
+        The most certain place comes first, then the one that waits longest. One at a time, for
+        routers drop what follows too soon."""
         due = []
         for name, tier in self.tiers.items():
             last_tier, last_ns = self._sent.get(name, (UNKNOWN_TIER, 0))
@@ -99,9 +99,9 @@ class LandmarkSharing:
         _, last_ns, name = min(due)
         return self._own[name], last_ns
 
-    def note_sent(self, told: LandmarkBelief) -> None:
+    def note_sent(self, belief: LandmarkBelief) -> None:
         """This was sent."""
-        self._sent[told.landmark] = landmark_tier(told), told.stamp_ns
+        self._sent[belief.landmark] = landmark_tier(belief), belief.stamp_ns
 
 
 def _share(text: str) -> float:

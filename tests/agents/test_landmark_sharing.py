@@ -64,7 +64,7 @@ def asked_for(stand: TeamOnBus, robot: str) -> set[tuple[str, int]]:
     return set(interests.landmarks)
 
 
-def words(stand: TeamOnBus, robot: str) -> list[Flow]:
+def sent_places(stand: TeamOnBus, robot: str) -> list[Flow]:
     flows = stand.robots[robot].collaboration.counters.flows()
     return [flow for flow in flows if flow.topic == "landmark"]
 
@@ -93,31 +93,31 @@ def test_a_team_without_a_map_finds_itself_in_the_frame_of_one_robot() -> None:
     assert math.dist(latest.estimate.pose[:2], HERE["me"]) < 0.05
 
 
-def test_each_place_is_told_once_and_then_nothing_is_asked_for() -> None:
+def test_each_place_is_sent_once_and_then_nothing_is_asked_for() -> None:
     stand = TeamOnBus(team())
     look(stand, seconds=10.0)
-    (flow,) = words(stand, "guide")
+    (flow,) = sent_places(stand, "guide")
     assert flow.messages == len(PLACES)
     assert flow.bytes == flow.messages * sent_bytes(LANDMARK_BYTES)
     assert asked_for(stand, "me") == set()
-    assert words(stand, "me") == []
+    assert sent_places(stand, "me") == []
 
 
-def test_of_many_robots_that_know_a_place_few_tell_it() -> None:
+def test_of_many_robots_that_know_a_place_few_send_it() -> None:
     many = team()
     knowing = {f"guide{k}": many.robots["guide"] for k in range(20)}
     many = msgspec.structs.replace(many, robots={"me": many.robots["me"], **knowing})
     stand = TeamOnBus(many)
     look(stand, "me", seconds=10.0)
-    told = sum(flow.messages for name in knowing for flow in words(stand, name))
-    assert len(PLACES) <= told <= 4 * len(PLACES)
+    sent = sum(flow.messages for name in knowing for flow in sent_places(stand, name))
+    assert len(PLACES) <= sent <= 4 * len(PLACES)
     assert asked_for(stand, "me") == set()
 
 
-def test_nothing_is_told_about_landmarks_that_nobody_sees() -> None:
+def test_nothing_is_sent_about_landmarks_that_nobody_sees() -> None:
     stand = TeamOnBus(team())
     look(stand, "guide", seconds=5.0)
-    assert words(stand, "guide") == []
+    assert sent_places(stand, "guide") == []
     assert asked_for(stand, "me") == set()
 
 
@@ -148,14 +148,14 @@ def test_without_unsurveyed_landmarks_nothing_is_declared() -> None:
 
 
 @pytest.mark.parametrize("rules", [{"passive": False}, {"after_s": 60.0}], ids=str)
-def test_without_collaboration_no_place_is_told(rules: dict[str, Any]) -> None:
+def test_without_collaboration_no_place_is_sent(rules: dict[str, Any]) -> None:
     settings = {"collaboration": CollaborationSettings(**rules)}
     stand = TeamOnBus(team(guide={"known_landmarks": KNOWN, **settings}))
     look(stand, seconds=5.0)
-    assert words(stand, "guide") == []
+    assert sent_places(stand, "guide") == []
 
 
-def test_a_lost_robot_tells_no_place_that_it_found() -> None:
+def test_a_lost_robot_sends_no_place_that_it_found() -> None:
     stand = TeamOnBus(team(guide={"start": Start(x_m=0.0, y_m=0.0, known=False)}), here=["guide"])
     ear = stand.ear("landmark/**")
     stand.stand_still(5.0)
@@ -168,13 +168,13 @@ def test_the_budget_holds_for_places_too() -> None:
     stand = TeamOnBus(team(guide={"known_landmarks": KNOWN, **settings}))
     ear = stand.ear("landmark/**")  # somebody who never has enough
     look(stand, "guide", seconds=30.0)
-    (flow,) = words(stand, "guide")
+    (flow,) = sent_places(stand, "guide")
     assert 0 < flow.messages <= 3
     assert len(ear.samples) == flow.messages
     assert flow.over_budget > 0
 
 
-def test_a_word_on_what_is_no_landmark_of_the_team_is_counted() -> None:
+def test_a_belief_about_what_is_no_landmark_of_the_team_is_counted() -> None:
     stand = TeamOnBus(team(), here=["me"])
     odd = LandmarkBelief("guide", "box", stand.now_ns, 1.0, 2.0, (0.01, 0.0, 0.01))
     stand.put(topics.LANDMARK.at(landmark="box", tier=3, robot="guide"), odd)
@@ -223,9 +223,9 @@ def test_any_bytes_about_a_landmark_are_used_or_counted(payloads: list[bytes]) -
             topics.LANDMARK.at(landmark="oak", tier=0, robot="guide"), payload
         )
         look(stand, "me", seconds=0.2)
-    told = sum(flow.messages for flow in node.received.flows() if flow.topic == "landmark")
+    sent = sum(flow.messages for flow in node.received.flows() if flow.topic == "landmark")
     refused = sum(node.counts[reason] for reason in Refusal)
-    assert told + refused == len(payloads)
+    assert sent + refused == len(payloads)
     assert (node.counts + robot.counts).total() > before
     pose, covariance, _ = robot.filter.timeline.state.estimate
     assert all(map(math.isfinite, (*pose, *covariance)))
@@ -246,7 +246,7 @@ def test_over_zenoh_the_map_arrives_and_the_link_is_silent_afterwards() -> None:
         )
 
 
-# What is told, and when --------------------------------------------------------------------------
+# What is sent, and when --------------------------------------------------------------------------
 
 
 def place(name: str, sigma_m: float, robot: str = "me") -> LandmarkBelief:
@@ -259,30 +259,30 @@ def test_tiers_of_places() -> None:
     ]
 
 
-def test_the_best_place_is_told_first_and_each_again_after_a_second() -> None:
+def test_the_best_place_is_sent_first_and_each_again_after_a_second() -> None:
     sharing = LandmarkSharing("me", frozenset(PLACES))
     sharing.update((place("oak", 0.1), place("elm", 0.02), place("ash", 0.01, "mate")))
     sharing.ask(frozenset(PLACES), 0)
-    told = []
+    sent = []
     for k in range(1, 15):
-        found = sharing.next_word(k * SECOND // 10)
+        found = sharing.next_belief(k * SECOND // 10)
         if found is not None:
-            word = msgspec.structs.replace(found[0], stamp_ns=k * SECOND // 10)
-            sharing.note_sent(word)
-            told.append((k, word.landmark))
-    assert told == [(1, "elm"), (2, "oak"), (11, "elm"), (12, "oak")]
+            belief = msgspec.structs.replace(found[0], stamp_ns=k * SECOND // 10)
+            sharing.note_sent(belief)
+            sent.append((k, belief.landmark))
+    assert sent == [(1, "elm"), (2, "oak"), (11, "elm"), (12, "oak")]
 
 
-def test_a_place_of_a_better_tier_is_told_at_once() -> None:
+def test_a_place_of_a_better_tier_is_sent_at_once() -> None:
     sharing = LandmarkSharing("me", frozenset(PLACES))
     sharing.ask(frozenset(PLACES), 0)
     sharing.update((place("oak", 0.1),))
-    first = sharing.next_word(SECOND)
+    first = sharing.next_belief(SECOND)
     assert first is not None
     sharing.note_sent(msgspec.structs.replace(first[0], stamp_ns=SECOND))
-    assert sharing.next_word(SECOND + 1) is None
+    assert sharing.next_belief(SECOND + 1) is None
     sharing.update((place("oak", 0.03),))
-    assert sharing.next_word(SECOND + 1) is not None
+    assert sharing.next_belief(SECOND + 1) is not None
 
 
 def test_what_rounding_on_the_wire_adds_is_no_reason_to_ask_again() -> None:

@@ -260,13 +260,13 @@ def _unsurveyed_worlds() -> dict[str, World]:
         name = f"unsurveyed, clique, {len(seeing)} of 4 see landmarks"
         found[name] = World(team, tuple("abcd"), duration_s=LEARNING_S)
     for seeing in ("ab", "abcd"):
-        told = _with_guide(_seeing(seeing).team, "a")
+        guided = _with_guide(_seeing(seeing).team, "a")
         name = f"unsurveyed, clique, {len(seeing)} of 4 see landmarks, one knows them"
-        found[name] = World(told, tuple("abcd"), duration_s=LEARNING_S)
-    told = _with_guide(_seeing("abcd").team, "a")
-    searching = {n: r if n == "a" else replace(r, start=None) for n, r in told.robots.items()}
-    told = replace(told, robots=searching)
-    world = World(told, tuple("abcd"), duration_s=LEARNING_S, scored_from_s=10.0)
+        found[name] = World(guided, tuple("abcd"), duration_s=LEARNING_S)
+    guided = _with_guide(_seeing("abcd").team, "a")
+    searching = {n: r if n == "a" else replace(r, start=None) for n, r in guided.robots.items()}
+    guided = replace(guided, robots=searching)
+    world = World(guided, tuple("abcd"), duration_s=LEARNING_S, scored_from_s=10.0)
     found["unsurveyed, clique, one knows them and its start"] = world
     return found
 
