@@ -131,6 +131,14 @@ def test_the_drawing_of_a_team() -> None:
     assert max(map(len, lines)) <= 80
 
 
+def test_places_of_landmarks_have_a_row_too() -> None:
+    sent = (flow("landmark", "", 3, 1.0),)
+    arrivals = {"guide": seen(status("guide", 3, 0, sent=sent))}
+    now = traffic_from_statuses("five", ("guide",), arrivals, 0.0, 4.0)
+    (row,) = (line for line in rendered(traffic_view(now, "here")) if "landmark" in line)
+    assert row.split()[:2] == ["landmark", "3"]
+
+
 def test_colours_tell_kinds_the_lost_and_the_idle() -> None:
     console = Console(file=io.StringIO(), width=80, force_terminal=True, color_system="standard")
     with console.capture() as capture:
