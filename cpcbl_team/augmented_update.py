@@ -176,13 +176,13 @@ def updated_by_teammate(
 
 def updated_by_landmark_belief(
     prior: Estimate, common: CommonErrors, observation: Observation, number: int, splits: bool
-) -> tuple[Estimate, CommonErrors] | None:
-    """After a teammate's observation of a place, whose first parameter is this; None where it makes
-    the pose no better. By covariance intersection of all that is estimated: what the teammate knows
-    may have come from this robot. So less would be known of the errors of a camera after each;
-    where these are uncertain it is not used."""
+) -> tuple[Estimate, CommonErrors]:
+    """After a teammate's observation of a place, whose first parameter is this; as before where it
+    makes the pose no better. By covariance intersection of all that is estimated: what the teammate
+    knows may have come from this robot. So less would be known of the errors of a camera after
+    each; where these are uncertain it is not used."""
     if any(common.camera_covariance):
-        return None
+        return prior, common
     sensitivities: tuple[Sensitivity, ...] = (((number, 1.0),), ((number + 1, 1.0),))
     estimated = estimated_of(common, False)
 
@@ -198,7 +198,7 @@ def updated_by_landmark_belief(
         weight, _ = best_weight(lambda w: attempt(w, 1.0 / w).covariance.determinant())
         update = attempt(weight, 1.0 / weight)
     if update.covariance.determinant() >= prior.covariance.determinant() or not update.is_sound:
-        return None
+        return prior, common
     estimate, common = update.result(prior)
     return estimate._replace(shared=estimate.covariance if splits else estimate.shared), common
 

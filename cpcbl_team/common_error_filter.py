@@ -26,7 +26,7 @@ from cpcbl_team.places import EXACT, place_covariance
 from cpcbl_team.sensors import sighting_sigmas
 from cpcbl_team.state import State, with_calibration, with_common_errors, with_uses
 
-ZERO_ROW: Row = (0.0, 0.0, 0.0)
+_ZERO_ROW: Row = (0.0, 0.0, 0.0)
 _UNAFFECTED: tuple[Sensitivity, Sensitivity] = ((), ())
 
 
@@ -222,11 +222,10 @@ class CommonErrorFilter:
             return state
         x, y = common.place_error(belief.landmark)
         number, residuals = common.objects[belief.landmark], (belief.x_m - x, belief.y_m - y)
-        observation = Observation((ZERO_ROW, ZERO_ROW), residuals, EXACT, covariance)
-        after = updated_by_landmark_belief(prior, common, observation, number, self._splits)
-        if after is None:
-            return state
-        estimate, common = after
+        observation = Observation((_ZERO_ROW, _ZERO_ROW), residuals, EXACT, covariance)
+        estimate, common = updated_by_landmark_belief(
+            prior, common, observation, number, self._splits
+        )
         return with_common_errors(state._replace(estimate=estimate), common)
 
     def observed(

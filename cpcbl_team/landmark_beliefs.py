@@ -58,7 +58,9 @@ class LandmarkBeliefs:
         state, is_trusted = self._screen.screen_landmark_belief(state, belief, nis)
         if not is_trusted:
             return state
-        return self._merged(state, belief, covariance, nis, "landmark_gated")
+        if nis > self._gate:
+            return state.counted("landmark_gated")
+        return self._merged(state, belief, covariance)
 
     def after_sighting(self, state: State, name: str) -> State:
         """The state when it sees this landmark: a belief about it is merged again now and then."""
@@ -68,7 +70,10 @@ class LandmarkBeliefs:
         if name not in state.memory.teammates.trusted_landmarks:
             return state
         found = self._compared(state, belief)
-        return state if found is None else self._merged(state, belief, *found)
+        if found is None:
+            return state
+        covariance, nis = found
+        return state if nis > self._gate else self._merged(state, belief, covariance)
 
     def _compared(self, state: State, belief: LandmarkBelief) -> tuple[Covariance2, float] | None:
         """The covariance of a belief (m^2) and its normalized innovation squared beside the place
@@ -79,11 +84,6 @@ class LandmarkBeliefs:
         covariance = self._screen.cautious(state, belief.robot, Covariance2(*belief.covariance))
         return covariance, common.landmark_belief_nis(state, belief, covariance)
 
-    def _merged(
-        self, state: State, belief: LandmarkBelief, covariance: Covariance2, nis: float, *count: str
-    ) -> State:
-        """The state with a belief, or in which it is counted that the gate has rejected it."""
-        if nis > self._gate:
-            return state.counted(*count)
+    def _merged(self, state: State, belief: LandmarkBelief, covariance: Covariance2) -> State:
         assert self._common is not None
         return self._common.with_landmark_belief(state, belief, covariance)

@@ -41,7 +41,6 @@ class LandmarkPlaces(NamedTuple):
     """Where landmarks are that are not on the team's map: as the robot itself has found them, or
     knew them before, and as teammates have said."""
 
-    stamp_ns: int
     places: tuple[LandmarkBelief, ...]
 
 

@@ -363,8 +363,13 @@ class CollaborationAgent:
 
     def _record_sent(self, sent: agent.HelpSent, now_ns: int) -> None:
         message = sent.message
-        topic, to = ("fix", message.robot) if isinstance(message, Fix) else ("belief", "")
-        topic = "landmark" if isinstance(message, LandmarkBelief) else topic
+        match message:
+            case Fix():
+                topic, to = "fix", message.robot
+            case LandmarkBelief():
+                topic, to = "landmark", ""
+            case _:
+                topic, to = "belief", ""
         if sent.size:
             self.counters.of(topic, to).add(sent.size, message.stamp_ns)
             if isinstance(message, Belief):

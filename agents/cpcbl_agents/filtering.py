@@ -190,7 +190,7 @@ class FilterAgent:
             if found is not None:
                 x, y, (xx, xy, yy) = found.position
                 places.append(LandmarkBelief(self._robot, name, now_ns, x, y, (xx, xy, yy)))
-        return [LandmarkPlaces(now_ns, tuple(places))]
+        return [LandmarkPlaces(tuple(places))]
 
     def _frame_estimates(self, now_ns: int) -> list[FrameEstimate]:
         """The estimate at each frame that odometry covers by now, or that waited long enough."""

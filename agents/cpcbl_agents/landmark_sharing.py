@@ -41,6 +41,9 @@ class LandmarkSharing:
         self._own: dict[str, LandmarkBelief] = {}
         self._known: dict[str, int] = {}  # the best tier in which each is known, by whomever
         self._asked_ns: dict[str, int] = {}
+        self.tiers: dict[str, int] = {}
+        """The landmarks whose places this robot knows of its own, and the tiers in which it tells
+        them."""
 
     @property
     def asked_for(self) -> frozenset[str]:
@@ -52,13 +55,6 @@ class LandmarkSharing:
         """Somebody asks for the places of these landmarks now, and of no others."""
         self._asked_ns = {name: self._asked_ns.get(name, now_ns) for name in names}
 
-    @property
-    def tiers(self) -> dict[str, int]:
-        """The landmarks whose places this robot knows of its own, and the tiers in which it tells
-        them."""
-        tiers = {name: landmark_tier(place) for name, place in self._own.items()}
-        return {name: tier for name, tier in tiers.items() if tier < UNKNOWN_TIER}
-
     def see(self, frame: Sightings) -> None:
         """The robot has seen this."""
         for sighting in frame.sightings:
@@ -68,6 +64,8 @@ class LandmarkSharing:
     def update(self, places: tuple[LandmarkBelief, ...]) -> None:
         """The robot knows these places now: of its own, or from others."""
         self._own = {place.landmark: place for place in places if place.robot == self._robot}
+        tiers = {name: landmark_tier(place) for name, place in self._own.items()}
+        self.tiers = {name: tier for name, tier in tiers.items() if tier < UNKNOWN_TIER}
         known: dict[str, int] = {}
         for place in places:
             tier = landmark_tier(place, ROUNDING)

@@ -12,7 +12,7 @@ Direction = Literal["one-way", "both-ways"]
 
 
 class BudgetSettings(Table, frozen=True, kw_only=True):
-    """What a robot may spend on fixes and beliefs; 0 means no limit."""
+    """What a robot may spend on fixes, beliefs and places of landmarks; 0 means no limit."""
 
     bytes_per_s: NotNegative = 0.0
     """With Zenoh's own bytes, without those of TCP/IP. It holds over any 10 s; below 50 B/s,
