@@ -3,8 +3,7 @@ and their evidence."""
 
 import math
 from collections.abc import Iterable, Mapping
-from types import MappingProxyType
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 import msgspec
 
@@ -36,11 +35,10 @@ from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.geometry import Pose2, step, wrap_angle
 from cpcbl_team.inputs import Belief, HeadingBelief, LandmarkBelief, Sighting
 from cpcbl_team.parameters import Sensitivity
-from cpcbl_team.places import EXACT, ObjectPosition, map_object
+from cpcbl_team.places import EXACT, NO_BELIEFS, ObjectPosition, map_object
 from cpcbl_team.range_errors import RangeErrors
 from cpcbl_team.sensors import sighting_sigmas
 
-_NONE: Final[Mapping[str, LandmarkBelief]] = MappingProxyType({})
 BELIEF_VALID_BEFORE_NS = 500_000_000
 """A belief is also used for sightings of up to this time before it: a robot subscribes to a
 teammate's beliefs when it sees it, and what it saw before the first one came must not be lost."""
@@ -160,7 +158,7 @@ def measurement_of(
     teammates: Mapping[str, tuple[Belief, ...]],
     settings: config.LocalizationSettings,
     common: CommonErrors | None = None,
-    landmark_beliefs: Mapping[str, LandmarkBelief] = _NONE,
+    landmark_beliefs: Mapping[str, LandmarkBelief] = NO_BELIEFS,
 ) -> Measurement | None:
     """The sighting, from about `pose`, with its object's position; None if that is not known.
     `landmark_beliefs`: as of `map_object`."""

@@ -14,7 +14,7 @@ from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.inputs import LandmarkBelief
 
 EXACT = Covariance2(0.0, 0.0, 0.0)
-_NONE: Final[Mapping[str, LandmarkBelief]] = MappingProxyType({})
+NO_BELIEFS: Final[Mapping[str, LandmarkBelief]] = MappingProxyType({})
 
 
 class ObjectPosition(NamedTuple):
@@ -39,7 +39,7 @@ def map_object(
     field: Field,
     name: str,
     common: CommonErrors | None = None,
-    beliefs: Mapping[str, LandmarkBelief] = _NONE,
+    beliefs: Mapping[str, LandmarkBelief] = NO_BELIEFS,
 ) -> MapObject | None:
     """The object of this name; None if its place is not known. `common`: of a robot that estimates
     the places of objects with its pose. `beliefs`: of teammates, about unsurveyed landmarks; they

@@ -72,7 +72,7 @@ class TeammateScreen:
         self, state: State, landmarks: LandmarkUpdate, gated: GatedObjects
     ) -> tuple[State, GatedObjects]:
         """The state, and the gated objects without the teammates that the robot does not trust."""
-        now, is_lost = state.stamp_ns, bool(state.memory.recovery.lost)
+        is_lost = bool(state.memory.recovery.lost)
         accepted, rejected = (
             sum(not found.measurement.sender for found in objects) for objects in gated
         )
@@ -81,54 +81,39 @@ class TeammateScreen:
             sums = combine(Information.of(landmarks.evidence.sums()), gated.accepted)
             own = _own_offset(state, sums, gated.accepted)
             state = self._with_own_sensors(state, accepted, rejected, own)
-        state, distrusted = self._screen_landmarks(state, gated)
-        for m, constraints, nis, observation, _ in (*gated.accepted, *gated.rejected):
-            if m.is_teammate:
-                is_fresh = _has_fresh(state.memory.teammates.beliefs[m.source], now)
-                of_two = 2.0 * nis / len(constraints) if is_fresh and not is_lost else None
-                evidence = None
-                if of_two is not None and observation:
-                    evidence = _with_camera(state, m, self._evidence(state, observation))
-                report = TeammateReport(
-                    now, of_two, evidence=evidence, is_guest=self._is_guest(m.source)
-                )
-                state, is_trusted = self._assess(state, m.source, report, m.source)
-                if not is_trusted:
-                    distrusted.add(m.source)
+        state, distrusted = self._screen_reports(state, gated)
         if distrusted:
             gated = GatedObjects(*(_without(objects, distrusted) for objects in gated))
         accepted_ = [self._with_caution(state, found) for found in gated.accepted]
         return state, gated._replace(accepted=accepted_)
 
-    def _screen_landmarks(self, state: State, gated: GatedObjects) -> tuple[State, set[str]]:
-        """The state after the landmarks of a frame that stand where teammates say, and the senders
-        that are not trusted. All landmarks of a sender are one report of it, for they have the
-        error of this robot's own pose in common."""
-        by_sender: dict[str, list[GatedObject]] = {}
+    def _screen_reports(self, state: State, gated: GatedObjects) -> tuple[State, set[str]]:
+        """The state after what teammates say of the objects of a frame, and those that are not
+        trusted. A teammate that is seen is a report of its own. All landmarks that stand where it
+        says are one report, for they have the error of this robot's own pose in common."""
+        reports: dict[tuple[str, bool], list[GatedObject]] = {}
         for found in (*gated.accepted, *gated.rejected):
             m = found.measurement
-            if m.sender and not m.is_teammate:
-                by_sender.setdefault(m.sender, []).append(found)
-        distrusted = set()
-        for sender, objects in sorted(by_sender.items()):
-            freedom = sum(len(found.constraints) for found in objects)
-            of_two = 2.0 * sum(found.nis for found in objects) / freedom
-            evidence, first = None, objects[0]
-            if first.observation is not None:
-                of_it = self._evidence(state, first.observation)
-                evidence = _with_camera(state, first.measurement, of_it)
-            report = TeammateReport(
-                state.stamp_ns,
-                None if state.lost else of_two,
-                evidence=evidence,
-                is_guest=self._is_guest(sender),
-            )
+            if m.sender:
+                reports.setdefault((m.sender, m.is_teammate), []).append(found)
+        now, distrusted = state.stamp_ns, set()
+        for (sender, is_teammate), objects in reports.items():
+            beliefs = state.memory.teammates.beliefs
+            is_fresh = not is_teammate or _has_fresh(beliefs[sender], now)
+            of_two, evidence, (first, *_) = None, None, objects
+            if is_fresh and not state.lost:
+                freedom = sum(len(found.constraints) for found in objects)
+                of_two = 2.0 * sum(found.nis for found in objects) / freedom
+                if first.observation:
+                    of_it = self._evidence(state, first.observation)
+                    evidence = _with_camera(state, first.measurement, of_it)
+            report = TeammateReport(now, of_two, evidence=evidence, is_guest=self._is_guest(sender))
             state, is_trusted = self._assess(state, sender, report, first.measurement.source)
             if not is_trusted:
                 distrusted.add(sender)
-        if by_sender:  # what they say is used now, whenever they said it
+        if not all(is_teammate for _, is_teammate in reports):  # used now, whenever it was said
             memory = state.memory.teammates
-            state = with_teammates(state, memory._replace(last_report_ns=state.stamp_ns))
+            state = with_teammates(state, memory._replace(last_report_ns=now))
         return state, distrusted
 
     def _with_caution(self, state: State, found: GatedObject) -> GatedObject:

@@ -90,14 +90,14 @@ def _innovations(problem: Problem, x: Floats, information: Floats) -> Iterator[C
         pulled = prior @ (x[column : column + 2] - value)
         off = x[column : column + 2] - value + others @ pulled
         variances, axes = np.linalg.eigh(0.5 * (others + others.T))
-        told = axes[:, (variances > 0.0) & (variances < LARGEST_VARIANCE)]
-        if told.shape[1] == 0:
+        known_axes = axes[:, (variances > 0.0) & (variances < LARGEST_VARIANCE)]
+        if known_axes.shape[1] == 0:
             continue
-        along = told.T @ off
-        spread = told.T @ (others + np.linalg.inv(prior)) @ told
+        along = known_axes.T @ off
+        spread = known_axes.T @ (others + np.linalg.inv(prior)) @ known_axes
         nis = float(along @ np.linalg.solve(spread, along))
         yield Contradiction(
-            index, told @ along, index >= problem.landmarks, float(np.sqrt(max(nis, 0.0)))
+            index, known_axes @ along, index >= problem.landmarks, float(np.sqrt(max(nis, 0.0)))
         )
 
 
