@@ -119,14 +119,15 @@ Blind = Annotated[str, Option(help="Robots that cannot see landmarks, e.g. 3,4,5
 _limit = partial(Option, min=0.0, callback=check_callback(_require_limit))
 BytesPerS = Annotated[
     float | None,
-    _limit(help="Bytes per second of fixes and beliefs that each robot may send; 0: no limit."),
+    _limit(help="Bytes per second of help that each robot may send; 0: no limit."),
 ]
 MessagesPerMinute = Annotated[
-    float | None, _limit(help="Fixes and beliefs per minute that each robot may send; 0: no limit.")
+    float | None,
+    _limit(help="Messages of help per minute that each robot may send; 0: no limit."),
 ]
 MatchMessages = Annotated[
     int | None,
-    Option(min=0, help="Fixes and beliefs that the team may send in a match; 0: no limit."),
+    Option(min=0, help="Messages of help that the team may send in a match; 0: no limit."),
 ]
 NoiseSeed = Annotated[int, Option(help="Seed of the simulated noise.")]
 Jobs = Annotated[int | None, Option(min=1, help="Processes at a time; default: all cores.")]
