@@ -87,6 +87,10 @@ MarkdownFile = Annotated[
     Path | None,
     Option(callback=options.writable_file, help="File to write the table into, as Markdown."),
 ]
+Retries = Annotated[
+    int,
+    Option(min=0, help="Run a scenario that does not hold up to N times more; both are reported."),
+]
 
 
 def evaluate(
@@ -280,6 +284,7 @@ def chaos(
     history: HistoryFile = None,
     require_judged: RequireJudged = False,
     markdown: MarkdownFile = None,
+    retries: Retries = 0,
     report: options.ReportFile = None,
     as_json: options.AsJson = False,
 ) -> None:
@@ -302,7 +307,7 @@ def chaos(
     _prepare_for_faults()
     with runner.Progress(Console(stderr=True), len(todo)) as shown:
         chosen = ScenarioOptions(seed, shown.on_step, duration, keys, history)
-        faults = runner.run_scenarios(todo, chosen, shown.on_begin, shown.on_end)
+        faults = runner.run_scenarios(todo, chosen, shown.on_begin, shown.on_end, retries=retries)
     result = report_data(faults)
     lost = options.write_report(report, result)
     if (page := markdown) is not None:

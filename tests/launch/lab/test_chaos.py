@@ -11,14 +11,16 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, nullcontext
+from io import StringIO
 from pathlib import Path
 
 import pytest
+from rich.console import Console
 from support.buses import Subscription, wait_until
 from support.processes import command_line, cpcbl_team, eventually, pids_of
 from support.routers import open_router
 
-from cpcbl_launch.lab.chaos.checks import Check, Outcome
+from cpcbl_launch.lab.chaos.checks import ChaosReport, Check, Outcome
 from cpcbl_launch.lab.chaos.injectors import echoes
 from cpcbl_launch.lab.chaos.links import (
     MOST_CONNECTIONS,
@@ -27,7 +29,12 @@ from cpcbl_launch.lab.chaos.links import (
     TunLink,
     missing_tun,
 )
-from cpcbl_launch.lab.chaos.runner import run_scenario, run_scenarios, select_scenarios
+from cpcbl_launch.lab.chaos.runner import (
+    print_faults,
+    run_scenario,
+    run_scenarios,
+    select_scenarios,
+)
 from cpcbl_launch.lab.chaos.scenario import (
     Requirement,
     Scenario,
@@ -131,6 +138,34 @@ def test_a_failure_and_a_missing_requirement_are_distinguished() -> None:
     assert faults.outcomes[3].not_run == "needs root"
     assert began == [o.scenario for o in done] == ["good", "bad", "broken", "rooted"]
     assert not faults.is_met
+
+
+@pytest.mark.parametrize(("retries", "held"), [(0, False), (1, False), (2, True), (5, True)])
+def test_a_scenario_that_does_not_hold_is_tried_again(retries: int, held: bool) -> None:
+    seen = iter((0.0, 0.5, 1.0))
+
+    def holds_at_last(_: ScenarioOptions) -> ScenarioResult:
+        return ScenarioResult([Check(what="m", seen=next(seen), at_least=1)], ("warm",))
+
+    table, done = [scenario_of("shaky")._replace(run=holds_at_last)], list[Outcome]()
+    calls = lambda _: None, done.append
+    faults = run_scenarios(table, ScenarioOptions(), *calls, nullcontext, retries=retries)
+    (outcome,) = faults.outcomes
+    assert (outcome.is_met, done) == (held, [outcome])
+    before = ("attempt 1 did not hold: m 0 (≥ 1)", "attempt 2 did not hold: m 0.5 (≥ 1)")
+    assert [r for r in outcome.remarks if r != "warm"] == list(before[: min(retries, 2)])
+
+
+def test_what_did_not_hold_is_said_once_more_at_the_end() -> None:
+    bad = Check(what="m", seen=0, at_least=1)
+    outcomes = tuple(
+        Outcome(scenario=name, done="", expectation="", checks=(check,))
+        for name, check in {"good": Check(what="m", seen=1, at_least=1), "bad": bad}.items()
+    )
+    console = Console(record=True, width=100, file=StringIO())
+    print_faults(ChaosReport(version="", seed=1, machine="here", outcomes=outcomes), console)
+    last = console.export_text().splitlines()[-2:]
+    assert last == ["NOT HELD: bad: m 0 (≥ 1)", "1 held, 1 NOT HELD; here; seed 1"]
 
 
 @pytest.mark.long

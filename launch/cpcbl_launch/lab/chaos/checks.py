@@ -84,6 +84,11 @@ class Outcome(msgspec.Struct, frozen=True, kw_only=True):
             return None
         return not self.failed and bool(self.checks) and all(c.is_met for c in self.checks)
 
+    @property
+    def problem(self) -> str:
+        """What did not hold, in one line."""
+        return self.failed or "; ".join(str(c) for c in self.checks if not c.is_met) or "no checks"
+
 
 def excused_by_load(outcome: Outcome, too_busy: str) -> Outcome:
     """The outcome where the machine was `too_busy` (empty: it was not). What was met is met; what

@@ -76,19 +76,34 @@ def run_scenario(scenario: Scenario, options: ScenarioOptions) -> Outcome:
     return replace(outcome, seconds=ended_s - began_s)
 
 
+def _run_until_held(scenario: Scenario, options: ScenarioOptions, retries: int) -> Outcome:
+    outcome = run_scenario(scenario, options)
+    for attempt in range(1, retries + 1):
+        if outcome.is_met is not False:
+            break
+        before = (*outcome.remarks, f"attempt {attempt} did not hold: {outcome.problem}")
+        outcome = run_scenario(scenario, options)
+        outcome = replace(outcome, remarks=(*before, *outcome.remarks))
+    return outcome
+
+
 def run_scenarios(
     scenarios: Iterable[Scenario],
     options: ScenarioOptions,
     on_begin: Callable[[Scenario], None],
     on_end: Callable[[Outcome], None],
     watching: Callable[[], AbstractContextManager[MachineWatch | None]] = MachineWatch,
+    retries: int = 0,
 ) -> ChaosReport:
-    """Runs scenarios; calls `on_begin` and `on_end` for each. `watching` the machine meanwhile."""
+    """Runs scenarios; calls `on_begin` and `on_end` for each. `watching` the machine meanwhile.
+    A scenario that does not hold is run up to `retries` times more: its last outcome counts, and
+    what did not hold before is among its remarks."""
     outcomes = []
     with watching() as watch:
         for scenario in scenarios:
             on_begin(scenario)
-            outcomes.append(run_scenario(scenario, options._replace(machine=watch)))
+            watched = options._replace(machine=watch)
+            outcomes.append(_run_until_held(scenario, watched, retries))
             on_end(outcomes[-1])
     cores, load = os.cpu_count() or 1, os.getloadavg()[0]
     machine = f"{platform.system()} {platform.machine()}, {cores} cores, load {load:.1f}"
@@ -123,6 +138,9 @@ def print_faults(faults: ChaosReport, console: Console) -> None:
     for outcome in faults.outcomes:
         for remark in outcome.remarks:
             console.print(Text(f"{outcome.scenario}: {remark}", "dim"))
+    for outcome in faults.outcomes:
+        if outcome.is_met is False:  # once more, for who reads the end of a log
+            console.print(Text(f"NOT HELD: {outcome.scenario}: {outcome.problem}", "red"))
     counts = Counter(verdict(outcome).plain for outcome in faults.outcomes)
     all_verdicts = (*_VERDICT.values(), _NOT_JUDGED)
     summary = ", ".join(f"{counts[text]} {text}" for text, _ in all_verdicts if counts[text])

@@ -15,13 +15,15 @@ EVERY_NS = 100_000_000
 BURSTS: dict[Kind, int] = {"garbage": 10, "token-flood": 3, "odd-sightings": 1, "flood": 400}
 """How many messages a member sends at a time, ten times a second."""
 MOST_TOKENS, MOST_PUBLISHERS = 40, 100
+FLOODED = (*topics.INPUTS[:4], topics.FIX, topics.BELIEF)
+SIZES = (0, 1, 8, 32, 39, 40, 300)  # of meaningless payloads (bytes)
 
 
 class Member:
     """One member, as long as its event lasts."""
 
     def __init__(self, event: Event, network: Network, team: Team) -> None:
-        self._event, self._network, self._team = event, network, team
+        self._event, self._network, self._names = event, network, sorted(team.robots)
         self._is_over, self._tokens = False, list[Handle]()
         self._publishers: dict[str, Publisher] = {}
         self._bus = network.session(f"member{event.number}")
@@ -31,7 +33,7 @@ class Member:
         if self._is_over:
             return
         for _ in range(BURSTS[self._event.kind]):
-            key, payload = _message(self._event, self._dice, self._team)
+            key, payload = _message(self._event, self._dice, self._names)
             self._publisher(key).put(payload)
         if self._event.kind == "token-flood":
             self._declare_token()
@@ -57,20 +59,16 @@ class Member:
         self._tokens.append(self._bus.declare_token(key))
 
 
-def _message(event: Event, dice: Random, team: Team) -> tuple[str, bytes]:
-    """A key and a payload."""
+def _message(event: Event, dice: Random, names: list[str]) -> tuple[str, bytes]:
+    """A key and a payload; `names` of the team's robots."""
     robot, tier = event.robot, dice.randrange(16)
     if event.kind == "odd-sightings":
         return topics.IN_SIGHTINGS.at(robot=robot), _odd_sightings(dice)
     if event.kind == "token-flood":
         return topics.FIX.at(robot=robot, tier=tier, observer=_name(dice)), _fix_like(dice)
-    keys = (
-        *(topic.at(robot=robot) for topic in topics.INPUTS[:4]),
-        topics.FIX.at(robot=robot, tier=tier, observer=dice.choice(sorted(team.robots))),
-        topics.BELIEF.at(tier=tier, robot=dice.choice(sorted(team.robots))),
-    )
-    sizes = (0, 1, 8, 32, 39, 40, 300)
-    return dice.choice(keys), b"\xff" + dice.randbytes(dice.choice(sizes))
+    topic, member = dice.choice(FLOODED), dice.choice(names)
+    key = topic.at(robot=member if topic is topics.BELIEF else robot, tier=tier, observer=member)
+    return key, b"\xff" + dice.randbytes(dice.choice(SIZES))
 
 
 def _name(dice: Random) -> str:
