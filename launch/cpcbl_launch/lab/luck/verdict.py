@@ -66,8 +66,9 @@ def _waiting(log: RunLog, history: History, team: Team) -> Iterator[Violation]:
         if min(quiet_s, end_s - known_s) > back_s + 1.0 and (after_s is None or after_s > back_s):
             text = "never" if after_s is None else f"only {after_s:.1f} s after the last event"
             yield Violation("nobody waits", name, end_s, f"it was localized {text}")
-        if quiet_s > HELP_S and _misses_help(log, name, end_s):
-            yield Violation("nobody waits", name, end_s, f"no help for {HELP_S:g} s")
+        help_s = help_due_s(log, team, name, end_s)
+        if quiet_s > help_s and _misses_help(log, name, end_s - help_s):
+            yield Violation("nobody waits", name, end_s, f"no help for {help_s:g} s")
         if quiet_s > TRUST_S:
             for trust in quarantines(log, name, end_s):
                 if trust.peer in history.robots:
@@ -97,9 +98,29 @@ def _silent_until_s(history: History, team: Team) -> float:
     return max(starts_s) + max(windows_s) if starts_s and windows_s else 0.0
 
 
-def _misses_help(log: RunLog, robot: str, end_s: float) -> bool:
-    """Whether a robot that sees no landmark received no help lately."""
-    return is_blind(robot) and log.counts_between(robot, end_s - HELP_S)["messages_received"] == 0
+def _misses_help(log: RunLog, robot: str, from_s: float) -> bool:
+    """Whether a robot that sees no landmark received no help since then."""
+    return is_blind(robot) and log.counts_between(robot, from_s)["messages_received"] == 0
+
+
+def help_due_s(log: RunLog, team: Team, robot: str, end_s: float) -> float:
+    """After how long a blind robot should be helped again: where the budget of a teammate did not
+    allow a fix for it lately, a window later, for what is spent comes back then (docs/routing.md).
+    For a robot that is lost each budget has a reserve."""
+    from_s, windows_s = end_s - HELP_S, [0.0]
+    if any(s.lost for at_s, s in log.statuses.get(robot, ()) if at_s >= from_s):
+        return HELP_S
+    for name, settings in team.robots.items():
+        if _over_budget(log, name, robot, end_s) > _over_budget(log, name, robot, from_s):
+            windows_s += [w.window_s for w in budget_windows(settings.collaboration.budget)]
+    return HELP_S + max(windows_s)
+
+
+def _over_budget(log: RunLog, sender: str, receiver: str, until_s: float) -> int:
+    """The fixes for one robot that the budget of another had not allowed by then."""
+    statuses = [s for at_s, s in log.statuses.get(sender, ()) if at_s <= until_s]
+    flows = statuses[-1].sent if statuses else ()
+    return sum(f.over_budget for f in flows if f.peer == receiver)
 
 
 def frames_s(team: Team) -> float:
