@@ -254,12 +254,16 @@ class State(NamedTuple):
         return with_memory(self, self.memory.counted(*events)) if events else self
 
 
+def pose_of(start: Start) -> Pose2:
+    """The pose of a start."""
+    return Pose2(start.x_m, start.y_m, wrap_angle(math.radians(start.heading_deg)))
+
+
 def state_at_start(stamp_ns: int, start: Start | None, field: Field) -> State:
     """The state at the start: at the configured pose, or lost somewhere on the field."""
     if start is not None and start.known:
         p, h = start.sigma_m**2, math.radians(start.heading_sigma_deg) ** 2
-        pose = Pose2(start.x_m, start.y_m, wrap_angle(math.radians(start.heading_deg)))
-        estimate = Estimate(pose, Covariance3(p, 0.0, p, 0.0, 0.0, h))
+        estimate = Estimate(pose_of(start), Covariance3(p, 0.0, p, 0.0, 0.0, h))
         return State(stamp_ns, estimate, odometry_until_ns=stamp_ns)
     x0, y0, x1, y1 = field.bounds()
     p = max(0.25 * (x1 - x0) ** 2, 0.25 * (y1 - y0) ** 2, 4.0)
