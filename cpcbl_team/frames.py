@@ -22,8 +22,8 @@ ORIGIN: Final = Start(x_m=0.0, y_m=0.0, heading_deg=0.0, sigma_m=0.0, heading_si
 TICK_NS: Final = 100_000_000  # of the age in a frame's name
 DIGITS: Final = "0123456789abcdefghijklmnopqrstuvwxyz"
 AGE_DIGITS: Final = 7  # 248 years
-WAY_M: Final = 3.0  # by whose landmark, at this range and after as long a way, robots are compared
-STEPS_PER_OCTAVE: Final = 4  # of its sigma; rounded, so that nearly equal robots are equal
+WAY_M, RANGE_M = 1.0, 3.0  # robots are compared by a landmark at this range, after this way
+STEPS_PER_OCTAVE: Final = 8  # of its sigma; rounded, so that nearly equal robots are equal
 
 Rank = tuple[int, int, str, str]
 
@@ -66,13 +66,15 @@ def begins_frame(team: Team, robot: str) -> bool:
 
 
 def mapping_sigma_m(settings: RobotSettings) -> float:
-    """How well a robot maps: the sigma (m) of a landmark that it sees at `WAY_M` after a straight
-    way of that length, of which it starts at an exact pose."""
+    """How well a robot maps: the sigma (m) of a landmark that it sees at `RANGE_M`, after a
+    straight way of `WAY_M` from an exact pose."""
     sensor, wheels = settings.sensor, settings.odometry
-    turn_variance = wheels.turn_sigma_rad_per_sqrt_m**2 * WAY_M if wheels.moves else 0.0
-    way_variance = wheels.distance_sigma_m_per_sqrt_m**2 * WAY_M if wheels.moves else 0.0
-    across = WAY_M**2 * (sensor.bearing_sigma_rad**2 + turn_variance * (1.0 + 1.0 + 1.0 / 3.0))
-    return math.sqrt(range_sigma_m(sensor, WAY_M) ** 2 + way_variance + across)
+    variance = range_sigma_m(sensor, RANGE_M) ** 2 + (RANGE_M * sensor.bearing_sigma_rad) ** 2
+    if wheels.moves:
+        variance += WAY_M * wheels.distance_sigma_m_per_sqrt_m**2
+        levers = WAY_M * RANGE_M**2 + WAY_M**2 * RANGE_M + WAY_M**3 / 3.0
+        variance += levers * wheels.turn_sigma_rad_per_sqrt_m**2
+    return math.sqrt(variance)
 
 
 class FrameOrder:

@@ -67,8 +67,6 @@ from cpcbl_team.teammates import TeammateScreen
 from cpcbl_team.trusted_pose import agrees
 from cpcbl_team.variants import UpdateOrder, variant_of
 
-MOST_HEADING_SIGMA_RAD = math.radians(100.0)  # beyond, no bearing can be linearized
-
 _NO_OBJECTS: Final = GatedObjects([], [])
 
 
@@ -88,6 +86,7 @@ class Localizer:
         self.settings, self.field, rules = settings, field, settings.localizer
         gates = chi_square_bounds(rules.gate_probability)
         self._rules, self._gates = rules, gates
+        self._has_map = bool(field.landmarks or field.walls)
         self._minimum_interval_ns = rules.minimum_interval_s * 1e9
         self._widens = rules.variant != "weighted" and not rules.paper_uncertainty
         self._window = rules.lost_window
@@ -182,7 +181,7 @@ class Localizer:
         """The parts of the pose that may be updated now, first the one that waits longer; each
         type has its timer. The last is None: nothing."""
         updates = state.updates
-        if state.memory.recovery.lost and state.estimate.heading_sigma_rad > MOST_HEADING_SIGMA_RAD:
+        if state.has_no_heading:
             return (None,)
         order = self._variant.update_orders[updates.heading_is_latest]
         least = self._minimum_interval_ns
@@ -309,6 +308,8 @@ class Localizer:
         updates, prior, source = state.updates, state.estimate, observation.source
         if self._timers.is_cooling_down(updates, source, stamp_ns):
             return state
+        if not self._has_map and state.has_no_heading:  # else dead reckoning would give it one
+            return self.recovery.check(state)
         if self._timers.inflates:
             factor = self._timers.inflation(updates, source, stamp_ns)
             observation = observation.inflated(factor)

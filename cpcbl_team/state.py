@@ -33,6 +33,7 @@ from cpcbl_team.stationary_pose import StationaryRecord
 FIX = "fix:"  # marks the source of an active fix, apart from a sighting of that teammate
 _NONE: Mapping[str, Any] = MappingProxyType({})
 _NEVER_NS = -(2**61)
+MOST_HEADING_SIGMA_RAD = math.radians(100.0)  # beyond, no bearing can be linearized
 MOST_OBJECTS = 4096  # of which the last use is kept
 
 
@@ -242,6 +243,12 @@ class State(NamedTuple):
     def lost(self) -> str:
         """Why the robot is lost; empty if it is not."""
         return self.memory.recovery.lost
+
+    @property
+    def has_no_heading(self) -> bool:
+        """Whether the robot is lost and knows nothing of its heading."""
+        is_lost = bool(self.memory.recovery.lost)
+        return is_lost and self.estimate.heading_sigma_rad > MOST_HEADING_SIGMA_RAD
 
     @property
     def counts(self) -> Mapping[str, int]:

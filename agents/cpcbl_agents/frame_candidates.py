@@ -19,8 +19,8 @@ from cpcbl_team.timeline import Timeline
 MOST_CANDIDATES: Final = 3
 CONFIRM_NS: Final = 1_000_000_000  # a pose in another frame holds for so long before it is taken
 CERTAIN_RAD: Final = 0.2  # sigma of the heading: beyond, far ways are not straight any more,
-PATIENCE_NS: Final = 10_000_000_000  # so that such a pose is taken only after so long,
-RECENT_NS: Final = 2_000_000_000  # and while help comes that did not make it better
+PATIENCE_NS: Final = 10_000_000_000  # so that such a pose is taken only after so long
+RECENT_NS: Final = 5_000_000_000  # of help: without any, no pose gets better in another frame
 SILENT_NS: Final = 20_000_000_000  # a candidate without help for so long is given up
 LOST_NS: Final = 20_000_000_000  # after so long a lost robot begins a frame
 JOINED, BEGUN = "frame_joined", "frame_begun"  # the names of counts
@@ -42,24 +42,25 @@ class Candidate:
     def __init__(self, timeline: Timeline, now_ns: int) -> None:
         self.timeline, self.helped_ns = timeline, now_ns
         self._found_ns: int | None = None
+        self._is_certain = self._is_lost_again = False
 
     def is_ready(self, now_ns: int) -> bool:
         """Whether its pose has been known for long enough, and well enough."""
         state = self.timeline.latest(now_ns)
         if state.lost:
-            self._found_ns = None
-        elif self._found_ns is None:
-            self._found_ns = now_ns
-        if self._found_ns is None:
+            self._is_lost_again = self._found_ns is not None
             return False
-        known_ns = now_ns - self._found_ns
-        if state.estimate.heading_sigma_rad <= CERTAIN_RAD:
+        if self._found_ns is None:
+            self._found_ns = now_ns
+        known_ns, is_helped = now_ns - self._found_ns, now_ns - self.helped_ns <= RECENT_NS
+        self._is_certain |= is_helped and state.estimate.heading_sigma_rad <= CERTAIN_RAD
+        if self._is_certain:
             return known_ns >= CONFIRM_NS
-        return known_ns >= PATIENCE_NS and now_ns - self.helped_ns <= RECENT_NS
+        return known_ns >= PATIENCE_NS and is_helped
 
     def is_given_up(self, now_ns: int) -> bool:
-        """Whether nobody helps any more."""
-        return now_ns - self.helped_ns > SILENT_NS
+        """Whether nobody helps any more, or the pose that was found was wrong."""
+        return self._is_lost_again or now_ns - self.helped_ns > SILENT_NS
 
 
 class RobotFrames:
