@@ -3,7 +3,6 @@
 `Localizer` holds the settings of one robot; each of its methods maps a `State` to the next one.
 """
 
-import math
 from collections.abc import Iterable
 from typing import Final
 

@@ -8,7 +8,6 @@ from typing import NamedTuple
 
 import numpy as np
 from msgspec.structs import replace
-from support.simulated import SteppableProxy
 
 from cpcbl_agents.node import Node, NodeStart, Steppable
 from cpcbl_agents.robot import build_robot
@@ -18,12 +17,12 @@ from cpcbl_launch.simulation.field_node import FieldNode
 from cpcbl_launch.simulation.in_process import run_nodes
 from cpcbl_launch.team.file import builtin_path, load_team
 from cpcbl_team.config import Field, Team
-from cpcbl_team.geometry import wrap_angle
 from cpcbl_team.tiers import LOWEST_TIER
 from cpcbl_transport.bus import Bus, BusProxy, Publisher, PublisherProxy
 from cpcbl_transport.memory_bus import MemoryHub
 from cpcbl_transport.messages import Track
 from cpcbl_transport.topics import Qos
+from support.simulated import SteppableProxy
 
 STEP_NS = 100_000_000
 HELP = ("belief/", "fix/", "landmark/")
@@ -116,7 +115,7 @@ class World:
             name,
             self.now_ns,
             *state.reported.pose,
-            tuple(state.reported.covariance),
+            state.reported.covariance,
             LOWEST_TIER,
             state.lost,
             frame,

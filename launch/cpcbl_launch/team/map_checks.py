@@ -98,12 +98,8 @@ def map_warnings(team: Team) -> Iterator[str]:
                 f"robots.{name}.localizer.variant: {robot.localizer.variant} does not find"
                 " landmarks that nobody has surveyed; use variant joint"
             )
-    has_frame = bool(team.map.landmarks or team.map.walls)
-    knows = (r.start or r.position_sensor or r.known_landmarks for r in team.robots.values())
-    has_frame = has_frame or any(knows)
-    if not (has_frame or is_agreed) and all(
-        robot.source != "mrclam" for robot in team.robots.values()
-    ):
+    has_frame = is_agreed or any(knows_field(team, name) for name in team.robots)
+    if not has_frame and all(robot.source != "mrclam" for robot in team.robots.values()):
         yield (
             "map.unsurveyed: no robot knows its start, and nothing else is on the map, so robots"
             ' stay lost; give a robot a start, or write frame = "agreed" in [map]'
