@@ -9,7 +9,7 @@ from typing import TypeVar
 from cpcbl_agents.agent import Presence, TeammateFrame
 from cpcbl_agents.interests import Interests
 from cpcbl_team.config import CollaborationSettings
-from cpcbl_team.frames import FIELD
+from cpcbl_team.frames import FIELD, frame_text
 from cpcbl_team.tiers import LOWEST_TIER, accepted_tiers
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus, Handle, LivelinessCallback, MessageCallback, Publisher
@@ -31,7 +31,9 @@ class Declarations:
         bus: Bus,
         on_message: MessageCallback,
         on_token: LivelinessCallback,
+        says_frame: bool = False,
     ) -> None:
+        """`says_frame`: of a team whose frame is agreed."""
         self._robot, self._incarnation, self._rules = robot, incarnation, rules
         self._bus, self._on_message, self._on_token = bus, on_message, on_token
         self._publishers: dict[str, Publisher] = {}
@@ -44,6 +46,7 @@ class Declarations:
         self._keys: frozenset[str] = frozenset()
         self._keys_of_landmarks: dict[str, str] = {}
         self._frame_token: Handle | None = None
+        self._says_frame = says_frame
         self.tier: int | None = None
         """The tier that is announced."""
         self.frame = FIELD
@@ -64,8 +67,9 @@ class Declarations:
         tier, neighbours, sources, landmarks, frame, others = interests
         is_new_frame = frame != self.frame
         is_new_tier, old_token = tier != self.tier or is_new_frame, self._token
-        if is_new_frame:
-            self._declare_frame(frame)
+        self.frame = frame
+        if self._says_frame and (is_new_frame or self._frame_token is None):
+            self._declare_frame()
         if is_new_tier:
             self.tier = tier
             own = {"robot": self._robot, "incarnation": self._incarnation}
@@ -96,11 +100,11 @@ class Declarations:
         assert self.tier is not None
         return tier_chunk(self.tier, self.frame)
 
-    def _declare_frame(self, frame: str) -> None:
+    def _declare_frame(self) -> None:
         """Says in which frame the robot is from now on."""
-        old, self.frame = self._frame_token, frame
-        own = {"robot": self._robot, "incarnation": self._incarnation}
-        self._frame_token = self._bus.declare_token(topics.FRAME.at(frame=frame, **own))
+        old, own = self._frame_token, {"robot": self._robot, "incarnation": self._incarnation}
+        key = topics.FRAME.at(frame=frame_text(self.frame), **own)
+        self._frame_token = self._bus.declare_token(key)
         if old is not None:
             old.close()
 
@@ -157,8 +161,9 @@ class LivelinessTokens:
     def update(self, key: str, alive: bool) -> Presence | TeammateFrame | None:
         """What is known of a teammate by now; None if the key is no robot's token."""
         if names := topics.FRAME.names(key):
-            frame = _newest(self._frames, names["robot"], key, names["frame"], alive)
-            return TeammateFrame(names["robot"], frame)
+            frame = FIELD if names["frame"] == frame_text(FIELD) else names["frame"]
+            newest_frame = _newest(self._frames, names["robot"], key, frame, alive)
+            return TeammateFrame(names["robot"], newest_frame)
         names = topics.ALIVE.names(key) or {}
         chunk, frame = topics.tier_and_frame(names.get("tier", ""))
         tier = _TIERS.get(chunk)

@@ -114,8 +114,9 @@ class Node:
         self.arrivals, self._load = tape.arrivals(*named, callbacks.on_arrival), LoadMonitor(speed)
         robot.sensing.wrap(tape)
         put_message, put_token = self.arrivals.put_message, self.arrivals.put_token
+        is_agreed = team.map.frame == "agreed"
         self._declarations = Declarations(
-            robot.name, incarnation, rules, bus, put_message, put_token
+            robot.name, incarnation, rules, bus, put_message, put_token, is_agreed
         )
         self._pose = PoseOutput(robot, bus, team.robots[robot.name].pose_rate_hz, start_ns)
         self._tokens = LivelinessTokens()
@@ -130,7 +131,7 @@ class Node:
             bus.subscribe(topic.at(robot=robot.name), put_message)
         own_tokens = topics.ALIVE.at(robot=robot.name)
         bus.watch_liveliness(own_tokens, self.arrivals.put_own_name)
-        if team.map.frame == "agreed":
+        if is_agreed:
             bus.watch_liveliness(topics.FRAME.at(), self.arrivals.put_token)
         tape.end()
 
