@@ -124,6 +124,7 @@ class CollaborationAgent:
                 if frame != self.frames.frame:
                     self.frames.set_places(places, frame)
                     return ()
+                self.frames.forget_places()
                 self.landmarks.update(places)
                 return self._landmark_beliefs(now_ns)
             case agent.FrameChanged(frame):

@@ -55,6 +55,10 @@ class TeammateFrames:
         if frame is not None and name in self._members:
             self._frames[name] = frame
 
+    def forget_places(self) -> None:
+        """What is known in better frames comes anew: a pose there may have been given up."""
+        self._known = {}
+
     def set_places(self, places: Iterable[LandmarkBelief], frame: str) -> None:
         """Where landmarks are in a better frame, as far as the robot knows there."""
         self._known[frame] = known_tiers(places)
