@@ -10,8 +10,10 @@ from collections import Counter, deque
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Final
 
+import numpy as np
 from msgspec.structs import replace
 
+from cpcbl_launch.reporting.metrics import Floats, interpolated_truth
 from cpcbl_team.estimate import Covariance3
 from cpcbl_team.frames import FIELD, frame_text, origin_robot
 from cpcbl_team.gaussian import Covariance2
@@ -32,6 +34,8 @@ class FrameOrigins:
         self._first: dict[str, Track] = {}  # tracks whose truth is not known yet
         self._truths: deque[Truths] = deque(maxlen=KEPT)
         self._seen: set[str] = {FIELD}
+        self.has_truth = False
+        """Whether any true pose has come."""
 
     def note_track(self, track: Track) -> None:
         """A track has come."""
@@ -48,16 +52,31 @@ class FrameOrigins:
     def note_truths(self, truths: Truths) -> None:
         """The truth of a time has come."""
         self._truths.append(truths)
+        self.has_truth = True
         if self._first:
             self._locate()
+
+    def locate(self, truth: Mapping[str, Floats]) -> None:
+        """The whole truth is known: rows of seconds, x, y, heading for each robot."""
+        self.has_truth |= bool(truth)
+        for frame, track in list(self._first.items()):
+            if track.robot in truth:
+                at, counts = interpolated_truth(
+                    np.array([track.stamp_ns * 1e-9]), truth[track.robot]
+                )
+                if counts[0]:
+                    self._set_origin(frame, track, Pose2(*at[0].tolist()))
 
     def _locate(self) -> None:
         for frame, track in list(self._first.items()):
             field_from_robot = _true_pose(self._truths, track)
             if field_from_robot is not None:
-                del self._first[frame]
-                frame_from_robot = Pose2(track.x_m, track.y_m, track.heading_rad)
-                self.field_from_frame[frame] = field_from_robot @ frame_from_robot.inverse()
+                self._set_origin(frame, track, field_from_robot)
+
+    def _set_origin(self, frame: str, track: Track, field_from_robot: Pose2) -> None:
+        del self._first[frame]
+        frame_from_robot = Pose2(track.x_m, track.y_m, track.heading_rad)
+        self.field_from_frame[frame] = field_from_robot @ frame_from_robot.inverse()
 
     def in_field(self, track: Track) -> Track:
         """The track in the field's frame, where its own is known there; else as it is."""

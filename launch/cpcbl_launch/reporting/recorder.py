@@ -281,11 +281,8 @@ class Recorder:
     def trajectory(self, robot: str, from_s: float = -np.inf) -> Trajectory:
         """A robot's estimates from `from_s` on. Where there is a truth, those in frames that are
         unknown beside it are left out."""
-        tracks = [
-            t
-            for t in self.tracks_in_field(robot)
-            if from_s <= t.stamp_ns * 1e-9 and not (t.frame and self.truths)
-        ]
+        own = (t for t in self.tracks_in_field(robot) if from_s <= t.stamp_ns * 1e-9)
+        tracks = [t for t in own if not (t.frame and self.origins.has_truth)]
         covariance = None
         if all(t.covariance is not None for t in tracks):
             covariance = np.array([t.covariance for t in tracks]).reshape(-1, 6)
@@ -308,6 +305,7 @@ class Recorder:
         self, variants: Mapping[str, str], truth: Mapping[str, Floats], from_s: float = -np.inf
     ) -> Report:
         """The figures of all robots from `from_s` on."""
+        self.origins.locate(truth)
         robots = {
             name: self.robot_report(name, variant, truth.get(name), from_s)
             for name, variant in variants.items()

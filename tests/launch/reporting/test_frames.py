@@ -2,6 +2,7 @@
 
 import math
 
+import numpy as np
 import pytest
 from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
 from msgspec.structs import replace
@@ -50,6 +51,16 @@ def test_the_first_track_of_a_frame_and_the_truth_tell_where_it_is() -> None:
     assert (places[0].x_m, places[0].y_m) == pytest.approx((4.0, 3.0))
     assert frame == ""
     assert places[0].covariance == pytest.approx((1.0, 0.0, 4.0))
+
+
+def test_the_truth_of_a_whole_run_tells_it_too() -> None:
+    """That of a run that is made again, which has no field on its bus."""
+    origins = FrameOrigins()
+    origins.note_track(began())
+    origins.locate({"r2": np.array([(0.0, *ORIGIN)])})
+    assert OWN not in origins.field_from_frame
+    origins.locate({"r1": np.array([(0.0, 5.0, 0.9, ORIGIN[2]), (0.2, 5.0, 1.1, ORIGIN[2])])})
+    assert origins.field_from_frame[OWN] == pytest.approx(ORIGIN)
 
 
 @pytest.mark.parametrize(
