@@ -10,6 +10,7 @@ from support.buses import SECOND
 from support.traffic import seen, status
 
 from cpcbl_launch.recordings.foxglove import FoxgloveRun
+from cpcbl_launch.reporting.events import EventLog
 from cpcbl_launch.reporting.frames import FrameOrigins, frames_text, main_frame
 from cpcbl_launch.simulation.in_process import simulate
 from cpcbl_launch.team.file import builtin_path, load_team
@@ -138,6 +139,18 @@ def test_the_page_draws_nothing_of_a_frame_whose_place_is_not_known() -> None:
     both = page(r1="", r2="")
     assert notice_text(both, "tests", "here", 10.1) == ""
     assert robot_pictures(both, both.robots, 10.1, 0.0)["r1"].truth is not None
+
+
+def test_a_change_of_frame_is_an_event() -> None:
+    log = EventLog()
+    tracks = [track("r1", at_s, 0.0, frame) for at_s, frame in enumerate(("", OWN, OWN, OTHER, ""))]
+    words = [event.words for t in tracks for event in log.events(t.stamp_ns, t)]
+    assert words == [
+        "ok",
+        f"is in frame {OWN}",
+        f"is in frame {OTHER}",
+        "is in frame field",
+    ]
 
 
 def test_merged_recordings_have_a_transform_between_frames_only_where_it_is_known() -> None:
