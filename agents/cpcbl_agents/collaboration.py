@@ -103,9 +103,11 @@ class CollaborationAgent:
             return None
         wanted = self.landmarks.wanted(self.latest.stamp_ns) if self._rules.passive else frozenset()
         own = self.tier, self.neighbours, self.sources, wanted, self.frames.frame
-        since_ns = self.latest.stamp_ns - IN_SIGHT_NS
-        in_sight = [name for name, fix in self._latest_fixes.items() if fix.stamp_ns > since_ns]
-        elsewhere = self.frames.keys(self._rules, in_sight, self.landmarks, self.latest.stamp_ns)
+        if not self.frames.better_frames:
+            return Interests(*own)
+        now_ns, seen = self.latest.stamp_ns, self._latest_fixes.items()
+        in_sight = [name for name, fix in seen if now_ns - fix.stamp_ns < IN_SIGHT_NS]
+        elsewhere = self.frames.keys(self._rules, in_sight, self.landmarks, now_ns)
         return Interests(*own, frozenset(elsewhere))
 
     @property

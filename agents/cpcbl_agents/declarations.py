@@ -96,9 +96,8 @@ class Declarations:
 
     @property
     def tier_chunk(self) -> str:
-        """The tier that is announced, as in keys."""
-        assert self.tier is not None
-        return tier_chunk(self.tier, self.frame)
+        """The tier that is announced, as in keys; the lowest before there is one."""
+        return tier_chunk(LOWEST_TIER if self.tier is None else self.tier, self.frame)
 
     def _declare_frame(self) -> None:
         """Says in which frame the robot is from now on."""

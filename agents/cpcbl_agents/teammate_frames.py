@@ -29,6 +29,8 @@ class TeammateFrames:
         self._known: dict[str, dict[str, int]] = {}
         self.tiers: dict[str, int] = {}
         """The tiers of those to whom it may be of help: of those in worse frames the lowest."""
+        self.better_frames: list[str] = []
+        """Those of teammates that are better than the robot's own, the best first."""
 
     def begin_frame(self, frame: str) -> None:
         """The robot is in this frame from now on."""
@@ -36,6 +38,7 @@ class TeammateFrames:
         self._known, self._announced, self.tiers = {}, {}, {}
         for name, (tier, its_frame) in announced.items():
             self.set_tier(name, tier, its_frame)
+        self._select_better()
 
     def set_tier(self, name: str, tier: int | None, frame: str) -> None:
         """A robot announces this tier in this frame; None: it is gone."""
@@ -54,6 +57,10 @@ class TeammateFrames:
         self._frames.pop(name, None)
         if frame is not None and name in self._members:
             self._frames[name] = frame
+        self._select_better()
+
+    def _select_better(self) -> None:
+        self.better_frames = self._order.better(self._frames.values(), self.frame)
 
     def forget_places(self) -> None:
         """What is known in better frames comes anew: a pose there may have been given up."""
@@ -71,10 +78,6 @@ class TeammateFrames:
         """The tier in the key of a fix for this robot. `own_chunk`: with the robot's own tier."""
         return own_chunk if self.is_in_frame(name) else tier_chunk(ANY_TIER, self.frame)
 
-    def better_frames(self) -> list[str]:
-        """The frames of teammates that are better than the robot's own, the best first."""
-        return self._order.better(self._frames.values(), self.frame)
-
     def keys(
         self,
         rules: CollaborationSettings,
@@ -84,8 +87,7 @@ class TeammateFrames:
     ) -> Iterator[str]:
         """The keys of help in better frames: of fixes, of beliefs of the robots in sight, and of
         places of landmarks in sight."""
-        frames = self.better_frames()
-        for frame in frames if rules.active else ():
+        for frame in self.better_frames if rules.active else ():
             yield topics.FIX.at(robot=self._robot, tier=tier_chunk(ANY_TIER, frame))
         if not rules.passive:
             return
@@ -93,7 +95,7 @@ class TeammateFrames:
             tier, frame = self._announced.get(name, (LOWEST_TIER, self.frame))
             if name in self._members and tier != LOWEST_TIER and self._is_better(frame):
                 yield topics.BELIEF.at(robot=name, tier=tier_chunk(tier, frame))
-        for frame in frames:
+        for frame in self.better_frames:
             known: Mapping[str, int] = self._known.get(frame, {})
             for landmark, tier in sharing.wanted(now_ns, known):
                 yield topics.LANDMARK.at(landmark=landmark, tier=tier_chunk(tier, frame))
