@@ -59,6 +59,7 @@ from cpcbl_team.state import (
     with_correction,
     with_recovery,
     with_teammates,
+    with_unknown_heading,
     with_uses,
 )
 from cpcbl_team.stationary_check import StationaryCheck
@@ -304,11 +305,10 @@ class Localizer:
 
     def _observe_pose(self, state: State, stamp_ns: int, observation: PoseObservation) -> State:
         state = self._record_observation(self.predict(state, stamp_ns), observation)
+        state = state if self._has_map else with_unknown_heading(state)
         updates, prior, source = state.updates, state.estimate, observation.source
         if self._timers.is_cooling_down(updates, source, stamp_ns):
             return state
-        if not self._has_map and state.has_no_heading:  # else dead reckoning would give it one
-            return self.recovery.check(state)
         if self._timers.inflates:
             factor = self._timers.inflation(updates, source, stamp_ns)
             observation = observation.inflated(factor)

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 from cpcbl_team.common_errors import CommonErrors
 from cpcbl_team.config import Field, Start
-from cpcbl_team.estimate import HEADING, POSE, POSITION, Covariance3, Estimate, Scope
+from cpcbl_team.estimate import HEADING, POSE, POSITION, ZERO3, Covariance3, Estimate, Scope
 from cpcbl_team.geometry import Pose2, new, wrap_angle
 from cpcbl_team.inputs import Belief, LandmarkBelief, Odometry, Sighting
 from cpcbl_team.map_rejections import MapRejections
@@ -293,6 +293,17 @@ def with_motion(state: State, stamp_ns: int, estimate: Estimate, place: Pose2) -
     """The predicted state; `place` is odometry_from_robot at `stamp_ns`."""
     _, _, _, odometry, until_ns, updates, memory = state
     return new(State, (stamp_ns, estimate, place, odometry, until_ns, updates, memory))
+
+
+def with_unknown_heading(state: State) -> State:
+    """The state of a lost robot that knows nothing of its heading: nothing of its position tells
+    it, for no motion with an unknown heading can be linearized. Any other state as it is."""
+    if not state.has_no_heading:
+        return state
+    pose, covariance, shared = state.estimate
+    covariance = covariance._replace(xh=0.0, yh=0.0)
+    shared = shared if shared is ZERO3 else shared._replace(xh=0.0, yh=0.0)
+    return state._replace(estimate=Estimate(pose, covariance, shared))
 
 
 def with_memory(state: State, memory: Memory) -> State:
