@@ -162,6 +162,20 @@ class InputsMended(msgspec.Struct, frozen=True, array_like=True, tag="mended"):
     position_sigma_m: float = 0.0
 
 
+class FrameChange(msgspec.Struct, frozen=True, array_like=True, tag="frame_change"):
+    """The robot is in this state's frame from now on. What it knows from the frame that it leaves:
+    counts, and landmarks that it found there, in its own frame (m) with their joint covariance
+    (m^2), two rows a landmark."""
+
+    stamp_ns: int
+    accepted: int
+    gated: int
+    events: dict[str, int]
+    landmarks: tuple[str, ...] = ()
+    places_m: tuple[tuple[float, float], ...] = ()
+    covariance: tuple[tuple[float, ...], ...] = ()
+
+
 Input = (
     Odometry
     | Sightings
@@ -172,4 +186,5 @@ Input = (
     | LandmarkBelief
     | BeliefShared
     | InputsMended
+    | FrameChange
 )

@@ -3,7 +3,6 @@
 `Localizer` holds the settings of one robot; each of its methods maps a `State` to the next one.
 """
 
-import math
 from collections.abc import Iterable
 from typing import Final
 
@@ -60,14 +59,13 @@ from cpcbl_team.state import (
     with_correction,
     with_recovery,
     with_teammates,
+    with_unknown_heading,
     with_uses,
 )
 from cpcbl_team.stationary_check import StationaryCheck
 from cpcbl_team.teammates import TeammateScreen
 from cpcbl_team.trusted_pose import agrees
 from cpcbl_team.variants import UpdateOrder, variant_of
-
-MOST_HEADING_SIGMA_RAD = math.radians(100.0)  # beyond, no bearing can be linearized
 
 _NO_OBJECTS: Final = GatedObjects([], [])
 
@@ -88,6 +86,7 @@ class Localizer:
         self.settings, self.field, rules = settings, field, settings.localizer
         gates = chi_square_bounds(rules.gate_probability)
         self._rules, self._gates = rules, gates
+        self._has_map = bool(field.landmarks or field.walls)
         self._minimum_interval_ns = rules.minimum_interval_s * 1e9
         self._widens = rules.variant != "weighted" and not rules.paper_uncertainty
         self._window = rules.lost_window
@@ -182,7 +181,7 @@ class Localizer:
         """The parts of the pose that may be updated now, first the one that waits longer; each
         type has its timer. The last is None: nothing."""
         updates = state.updates
-        if state.memory.recovery.lost and state.estimate.heading_sigma_rad > MOST_HEADING_SIGMA_RAD:
+        if state.has_no_heading:
             return (None,)
         order = self._variant.update_orders[updates.heading_is_latest]
         least = self._minimum_interval_ns
@@ -306,6 +305,7 @@ class Localizer:
 
     def _observe_pose(self, state: State, stamp_ns: int, observation: PoseObservation) -> State:
         state = self._record_observation(self.predict(state, stamp_ns), observation)
+        state = state if self._has_map else with_unknown_heading(state)
         updates, prior, source = state.updates, state.estimate, observation.source
         if self._timers.is_cooling_down(updates, source, stamp_ns):
             return state

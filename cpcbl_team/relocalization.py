@@ -59,7 +59,8 @@ def relocalize(
     It needs one residual more than unknowns, a fit that the chi-square bound accepts, no second
     pose that fits nearly as well, and a chi-square that rises to either side as that of a Gaussian
     does. What n pieces owe to teammates may be one and the same error: each counts it with n times
-    its variance (split covariance intersection of n, equal weights). A fix with a heading counts as
+    its variance (split covariance intersection of n, equal weights), and so do places that the
+    robot has found itself, from poses with one and the same error. A fix with a heading counts as
     two, for one error of its observer may be in both. It is a whole pose, but nothing confirms it
     while it is alone.
     """
@@ -68,6 +69,8 @@ def relocalize(
         return None
     repeated = sum(e.from_teammate for e in evidence) + headed
     uses = Counter(e.source for e in evidence if e.source in field.landmarks)
+    own = [e for e in evidence if e.source in field.unsurveyed and not e.from_teammate]
+    uses |= Counter({e.source: len(own) for e in own})
     pieces = [
         PropagatedEvidence(e, odometry_from_robot, repeated if e.from_teammate else uses[e.source])
         for e in evidence

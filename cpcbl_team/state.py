@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 from cpcbl_team.common_errors import CommonErrors
 from cpcbl_team.config import Field, Start
-from cpcbl_team.estimate import HEADING, POSE, POSITION, Covariance3, Estimate, Scope
+from cpcbl_team.estimate import HEADING, POSE, POSITION, ZERO3, Covariance3, Estimate, Scope
 from cpcbl_team.geometry import Pose2, new, wrap_angle
 from cpcbl_team.inputs import Belief, LandmarkBelief, Odometry, Sighting
 from cpcbl_team.map_rejections import MapRejections
@@ -33,6 +33,7 @@ from cpcbl_team.stationary_pose import StationaryRecord
 FIX = "fix:"  # marks the source of an active fix, apart from a sighting of that teammate
 _NONE: Mapping[str, Any] = MappingProxyType({})
 _NEVER_NS = -(2**61)
+MOST_HEADING_SIGMA_RAD = math.radians(100.0)  # beyond, no bearing can be linearized
 MOST_OBJECTS = 4096  # of which the last use is kept
 
 
@@ -244,6 +245,12 @@ class State(NamedTuple):
         return self.memory.recovery.lost
 
     @property
+    def has_no_heading(self) -> bool:
+        """Whether the robot is lost and knows nothing of its heading."""
+        is_lost = bool(self.memory.recovery.lost)
+        return is_lost and self.estimate.heading_sigma_rad > MOST_HEADING_SIGMA_RAD
+
+    @property
     def counts(self) -> Mapping[str, int]:
         """How often each thing has happened that has happened at all."""
         counts = {"accepted": self.updates.accepted, "gated": self.updates.gated}
@@ -254,12 +261,16 @@ class State(NamedTuple):
         return with_memory(self, self.memory.counted(*events)) if events else self
 
 
+def pose_of(start: Start) -> Pose2:
+    """The pose of a start."""
+    return Pose2(start.x_m, start.y_m, wrap_angle(math.radians(start.heading_deg)))
+
+
 def state_at_start(stamp_ns: int, start: Start | None, field: Field) -> State:
     """The state at the start: at the configured pose, or lost somewhere on the field."""
     if start is not None and start.known:
         p, h = start.sigma_m**2, math.radians(start.heading_sigma_deg) ** 2
-        pose = Pose2(start.x_m, start.y_m, wrap_angle(math.radians(start.heading_deg)))
-        estimate = Estimate(pose, Covariance3(p, 0.0, p, 0.0, 0.0, h))
+        estimate = Estimate(pose_of(start), Covariance3(p, 0.0, p, 0.0, 0.0, h))
         return State(stamp_ns, estimate, odometry_until_ns=stamp_ns)
     x0, y0, x1, y1 = field.bounds()
     p = max(0.25 * (x1 - x0) ** 2, 0.25 * (y1 - y0) ** 2, 4.0)
@@ -282,6 +293,17 @@ def with_motion(state: State, stamp_ns: int, estimate: Estimate, place: Pose2) -
     """The predicted state; `place` is odometry_from_robot at `stamp_ns`."""
     _, _, _, odometry, until_ns, updates, memory = state
     return new(State, (stamp_ns, estimate, place, odometry, until_ns, updates, memory))
+
+
+def with_unknown_heading(state: State) -> State:
+    """The state of a lost robot that knows nothing of its heading: nothing of its position tells
+    it, for no motion with an unknown heading can be linearized. Any other state as it is."""
+    if not state.has_no_heading:
+        return state
+    pose, covariance, shared = state.estimate
+    covariance = covariance._replace(xh=0.0, yh=0.0)
+    shared = shared if shared is ZERO3 else shared._replace(xh=0.0, yh=0.0)
+    return state._replace(estimate=Estimate(pose, covariance, shared))
 
 
 def with_memory(state: State, memory: Memory) -> State:

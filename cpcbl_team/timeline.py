@@ -12,10 +12,12 @@ from itertools import pairwise
 
 import msgspec
 
+from cpcbl_team.frame_changes import after_frame_change
 from cpcbl_team.inputs import (
     Belief,
     BeliefShared,
     Fix,
+    FrameChange,
     HeadingBelief,
     InitialPose,
     Input,
@@ -36,6 +38,10 @@ _PRUNE = 64
 _content = msgspec.msgpack.Encoder(enc_hook=float).encode
 
 _apply: dict[type, Callable[[Localizer, State, Input], State]] = {
+    FrameChange: lambda localizer, state, item: after_frame_change(
+        localizer.predict(state, item.stamp_ns),
+        item,  # type: ignore[arg-type]
+    ),
     Belief: Localizer.add_teammate_belief,  # type: ignore[dict-item]
     HeadingBelief: Localizer.add_teammate_belief,  # type: ignore[dict-item]
     LandmarkBelief: lambda localizer, state, belief: localizer.landmark_beliefs.add(state, belief),  # type: ignore
@@ -47,6 +53,7 @@ _apply: dict[type, Callable[[Localizer, State, Input], State]] = {
     InputsMended: Localizer.forget_wrong_inputs,  # type: ignore[dict-item]
     Odometry: Localizer.add_odometry,  # type: ignore[dict-item]
 }
+OWN_SENSORS = (Odometry, Sightings, InputsMended)
 _rank = {kind: rank for rank, kind in enumerate(_apply)}
 """The order of inputs of the same time. Odometry comes last: a piece that starts at a frame's time
 usually arrives after the frame, and does not change the pose at that time. A pose that somebody
@@ -120,6 +127,20 @@ class Timeline:
             is_belief = isinstance(item, Belief)
             state = self._apply(item, state) if is_belief else with_beliefs(after, state)
             states.append(state)
+
+    def branched(self, begun: Callable[[State], State]) -> "Timeline":
+        """Another timeline of the same localizer, for another frame: it begins with what `begun`
+        makes of the oldest state that is kept, and has all inputs since then that hold in any
+        frame, which are those of the robot's own sensors."""
+        branch = self.begun_anew(begun(self._states[0]))
+        for item in self._inputs:
+            if isinstance(item, OWN_SENSORS):
+                branch.add(item)
+        return branch
+
+    def begun_anew(self, state: State) -> "Timeline":
+        """A timeline of the same localizer, which begins with this state."""
+        return Timeline(self._localizer, state, self._horizon_ns)
 
     def latest(self, now_ns: int) -> State:
         """The state at `now_ns`, or at the end of the known odometry if that is earlier. If

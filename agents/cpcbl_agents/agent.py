@@ -8,6 +8,8 @@ from typing import NamedTuple
 
 from cpcbl_team.common_errors import CommonErrors
 from cpcbl_team.estimate import Estimate
+from cpcbl_team.frames import FIELD
+from cpcbl_team.geometry import Pose2
 from cpcbl_team.inputs import BeliefShared, InputsMended, LandmarkBelief, Sightings
 from cpcbl_transport.messages import Help, Message
 
@@ -39,9 +41,17 @@ class FrameEstimate(NamedTuple):
 
 class LandmarkPlaces(NamedTuple):
     """Where landmarks are that are not on the team's map: as the robot itself has found them, or
-    knew them before, and as teammates have said."""
+    knew them before, and as teammates have said; in the robot's frame, or in a better one."""
 
     places: tuple[LandmarkBelief, ...]
+    frame: str = FIELD
+
+
+class FrameChanged(NamedTuple):
+    """The robot's poses are in another frame from now on."""
+
+    frame: str
+    new_from_old: Pose2 | None  # None where the robot did not know its pose in the old one
 
 
 class Presence(NamedTuple):
@@ -49,6 +59,14 @@ class Presence(NamedTuple):
 
     robot: str
     tier: int | None
+    frame: str = FIELD  # in which its tier is
+
+
+class TeammateFrame(NamedTuple):
+    """The frame in which a teammate is; None when the teammate is gone."""
+
+    robot: str
+    frame: str | None
 
 
 class UnknownRobot(NamedTuple):
@@ -84,7 +102,13 @@ class HelpSent(NamedTuple):
 
 
 BusEvent = (
-    Presence | UnknownRobot | BeliefSubscribers | LandmarkSubscribers | FrameSubscribers | HelpSent
+    Presence
+    | TeammateFrame
+    | UnknownRobot
+    | BeliefSubscribers
+    | LandmarkSubscribers
+    | FrameSubscribers
+    | HelpSent
 )
 AgentMessage = (
     Message
@@ -92,6 +116,7 @@ AgentMessage = (
     | PoseEstimate
     | FrameEstimate
     | LandmarkPlaces
+    | FrameChanged
     | BeliefShared
     | InputsMended
     | BusEvent

@@ -14,11 +14,14 @@ from msgspec.structs import astuple, replace
 
 from cpcbl_agents import agent
 from cpcbl_agents.guests import GuestRegistry
+from cpcbl_agents.interests import Interests
 from cpcbl_agents.landmark_sharing import LandmarkSharing
 from cpcbl_agents.message_counters import MessageCounters
+from cpcbl_agents.teammate_frames import TeammateFrames
 from cpcbl_team import information_gain as gains
 from cpcbl_team.config import LocalizationSettings
 from cpcbl_team.fixes import fix_for, with_sensor_factor, without_heading
+from cpcbl_team.frames import FrameOrder
 from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.information_gain import FixMemory, HeadingMemory
 from cpcbl_team.inputs import Belief, Fix, HeadingBelief, LandmarkBelief
@@ -48,18 +51,6 @@ class _Offer(NamedTuple):
     fix: Fix
 
 
-class Interests(NamedTuple):
-    """What a robot announces and subscribes to."""
-
-    tier: int
-    neighbours: frozenset[str]
-    """Teammates seen not long ago, and possible guests: the robot watches their tiers."""
-    sources: frozenset[tuple[str, int]]
-    """Teammates, with their tiers, whose beliefs are useful to this robot."""
-    landmarks: frozenset[tuple[str, int]] = frozenset()
-    """Landmarks, with the tiers in which their places are useful to this robot."""
-
-
 class CollaborationAgent:
     """Keeps the robot's tier; turns its estimates and sightings into beliefs and fixes."""
 
@@ -72,10 +63,12 @@ class CollaborationAgent:
         budget: Budget,
         guests: GuestRegistry | None = None,
         sharing: LandmarkSharing | None = None,
+        frames: TeammateFrames | None = None,
     ) -> None:
         self._robot, self._settings, self._teammates = robot, settings, teammates
         self.guests = guests or GuestRegistry()
         self.landmarks = sharing or LandmarkSharing(robot, frozenset())
+        self.frames = frames or TeammateFrames(robot, teammates, FrameOrder({}))
         self._rules, self.budget = settings.collaboration, budget
         if settings.localizer.variant == "weighted":  # without a covariance there is no gain
             self._rules = replace(self._rules, least_value=0.0, least_use=0.0, belief_share=0.0)
@@ -84,7 +77,6 @@ class CollaborationAgent:
         self._track_ns = -1
         self._latest_fixes: dict[str, Fix] = {}
         self._early_fixes: dict[str, Fix] = {}  # of robots whose tier is not known yet
-        self._tiers: dict[str, int] = {}
         self._fix_memories: dict[str, tuple[int, FixMemory]] = {}
         self._needs: dict[str, gains.Need] = {}
         self._last_belief: Belief | None = None
@@ -110,7 +102,13 @@ class CollaborationAgent:
         if self.latest is None:
             return None
         wanted = self.landmarks.wanted(self.latest.stamp_ns) if self._rules.passive else frozenset()
-        return Interests(self.tier, self.neighbours, self.sources, wanted)
+        own = self.tier, self.neighbours, self.sources, wanted, self.frames.frame
+        if not self.frames.better_frames:
+            return Interests(*own)
+        now_ns, seen = self.latest.stamp_ns, self._latest_fixes.items()
+        in_sight = [name for name, fix in seen if now_ns - fix.stamp_ns < IN_SIGHT_NS]
+        elsewhere = self.frames.keys(self._rules, in_sight, self.landmarks, now_ns)
+        return Interests(*own, frozenset(elsewhere))
 
     @property
     def has_started(self) -> bool:
@@ -124,18 +122,25 @@ class CollaborationAgent:
             case agent.FrameEstimate():
                 self.landmarks.see(message.frame)
                 return self._fixes(message, now_ns)
-            case agent.LandmarkPlaces():
-                self.landmarks.update(message.places)
+            case agent.LandmarkPlaces(places, frame):
+                if frame != self.frames.frame:
+                    self.frames.set_places(places, frame)
+                    return ()
+                self.frames.forget_places()
+                self.landmarks.update(places)
                 return self._landmark_beliefs(now_ns)
+            case agent.FrameChanged(frame):
+                self._begin_frame(frame)
+            case agent.TeammateFrame(name, frame):
+                self.frames.set_frame(name, frame)
             case agent.LandmarkSubscribers(names):
                 self.landmarks.ask(names, now_ns)
-            case agent.Presence(name, tier):
+            case agent.Presence(name, tier, frame):
                 self.guests.set_presence(name, tier is not None)
-                self._tiers.pop(name, None)
                 if tier is None and name not in self._teammates:  # a guest: names are free
                     self._fix_memories.pop(name, None)
-                if tier is not None and (name in self._teammates or name in self.guests):
-                    self._tiers[name] = tier
+                is_one = name in self._teammates or name in self.guests
+                self.frames.set_tier(name, tier if is_one else None, frame)
             case agent.UnknownRobot(name):
                 self.guests.notice(name, now_ns)
             case agent.BeliefSubscribers():
@@ -144,6 +149,14 @@ class CollaborationAgent:
                 self._record_sent(message, now_ns)
         return ()
 
+    def _begin_frame(self, frame: str) -> None:
+        """Forgets what holds in the former frame alone."""
+        self.frames.begin_frame(frame)
+        self.landmarks.begin_frame()
+        self._latest_fixes, self._early_fixes, self._fix_memories = {}, {}, {}
+        self._needs, self._last_belief, self._heading_sources = {}, None, frozenset()
+        self.sources, self.tier = frozenset(), LOWEST_TIER
+
     def _handle_estimate(self, now: agent.PoseEstimate, now_ns: int) -> list[Track | Belief | Fix]:
         sigma, present = now.estimate.position_sigma_m, None if self.latest is None else self.tier
         self.latest, self._track_ns = now, now.stamp_ns
@@ -151,7 +164,8 @@ class CollaborationAgent:
         self._select_sources(now)
         pose, covariance, _ = now.estimate
         known = None if self._settings.localizer.variant == "weighted" else covariance
-        track = Track(self._robot, now.stamp_ns, *pose, known, self.tier, now.lost)
+        frame = self.frames.frame
+        track = Track(self._robot, now.stamp_ns, *pose, known, self.tier, now.lost, frame)
         early = self._sent_early(now_ns) if self._early_fixes and not now.lost else ()
         return [track, *self._beliefs(now, now_ns), *early]
 
@@ -172,9 +186,11 @@ class CollaborationAgent:
         self.neighbours = guests.union(self._latest_fixes)
         if self._rules.passive:
             self.sources = frozenset(
-                (name, self._tiers[name])
+                (name, self.frames.tiers[name])
                 for name, fix in self._latest_fixes.items()
-                if name in self._tiers and self._is_useful(fix, self._tiers[name], now)
+                if name in self.frames.tiers
+                and self.frames.is_in_frame(name)
+                and self._is_useful(fix, self.frames.tiers[name], now)
             )
             better = accepted_tiers(self.tier, self._rules)
             equals = frozenset(name for name, tier in self.sources if tier not in better)
@@ -218,7 +234,7 @@ class CollaborationAgent:
             self._latest_fixes[fix.robot] = fix
             if seen.lost or self.may_mislead:
                 continue
-            if fix.robot in self._tiers:
+            if fix.robot in self.frames.tiers:
                 self._early_fixes.pop(fix.robot, None)
                 offers += self._worth_sending(fix)
             else:
@@ -229,7 +245,7 @@ class CollaborationAgent:
         """The fixes of robots that were seen shortly before their tier became known, or before they
         were subscribed. Tiers are watched only of teammates that are seen, so at a rare meeting
         there may be no other fix."""
-        ready = [fix for name, fix in self._early_fixes.items() if name in self._tiers]
+        ready = [fix for name, fix in self._early_fixes.items() if name in self.frames.tiers]
         for fix in ready:
             del self._early_fixes[fix.robot]
         young = (fix for fix in ready if now_ns - fix.stamp_ns <= EARLY_NS)
@@ -239,7 +255,7 @@ class CollaborationAgent:
 
     def _worth_sending(self, fix: Fix) -> list[_Offer]:
         """The fix, if it may be sent now and is worth it."""
-        tier = self._tiers[fix.robot]
+        tier = self.frames.tiers[fix.robot]
         if not self._may_help(fix, tier):
             return []
         offer = self._offer(fix, tier)

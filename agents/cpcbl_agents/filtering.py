@@ -2,17 +2,20 @@
 
 import math
 from collections import Counter, deque
-from collections.abc import Sequence
+from collections.abc import Collection, Iterator, Sequence
 
 from cpcbl_agents.agent import (
     AgentMessage,
+    FrameChanged,
     FrameEstimate,
     LandmarkPlaces,
     PoseEstimate,
     Presence,
     Tick,
 )
+from cpcbl_agents.frame_candidates import RobotFrames
 from cpcbl_team.config import CameraSettings, Field, LocalizationSettings
+from cpcbl_team.frames import FIELD
 from cpcbl_team.inputs import (
     Belief,
     BeliefShared,
@@ -31,9 +34,9 @@ from cpcbl_team.miscalibration import percentages
 from cpcbl_team.places import map_object
 from cpcbl_team.self_calibration import SelfCalibration
 from cpcbl_team.sensors import recalibrated
-from cpcbl_team.timeline import Timeline
+from cpcbl_team.timeline import OWN_SENSORS, Timeline
 from cpcbl_team.trust import TrustStatus, trust_statuses
-from cpcbl_transport.messages import LandmarkEstimate, input_name
+from cpcbl_transport.messages import Help, LandmarkEstimate, input_name
 
 REPORT_INTERVAL_NS = 100_000_000
 OFF_FIELD = "off_field"  # why a pose is not set
@@ -52,9 +55,11 @@ class FilterAgent:
         camera: CameraSettings | None = None,
         robot: str = "",
         shared: frozenset[str] = frozenset(),
+        frames: RobotFrames | None = None,
     ) -> None:
         """`camera`: of a robot whose sightings are its camera's. `shared`: the landmarks whose
-        places `robot` may tell its teammates, and they it."""
+        places `robot` may tell its teammates, and they it. `frames`: of a team whose frame is
+        agreed."""
         localizer = Localizer(settings, field, teammates, camera)
         self.timeline = Timeline(localizer, localizer.start(start_ns))
         self.counts: Counter[str] = Counter()
@@ -73,6 +78,12 @@ class FilterAgent:
         self._reported_ns = start_ns
         self._odometry: Odometry | None = None
         self._covered_ns = start_ns
+        self._frames = frames
+
+    @property
+    def frame(self) -> str:
+        """The frame of its poses and places."""
+        return FIELD if self._frames is None else self._frames.frame
 
     @property
     def next_ns(self) -> int:
@@ -143,19 +154,43 @@ class FilterAgent:
             case Presence(name) if name not in self._known:
                 self._guests.add(name)
             case Tick() if now_ns >= self.next_ns:
+                changes = self._change_frame(now_ns)
                 frames, regular = self._frame_estimates(now_ns), self._regular_estimate(now_ns)
-                return [*frames, regular, *self._landmark_places(now_ns)]
+                return [*changes, *frames, regular, *self._landmark_places(now_ns)]
         return ()
 
     def _add(self, item: Input) -> bool:
         """Adds an input to the timeline; whether the timeline could use it."""
         refusal = self.timeline.add(item)
+        if self._frames is not None and isinstance(item, OWN_SENSORS):
+            self._frames.add(item)
         if refusal:
             self.counts[refusal] += 1
             if isinstance(item, Odometry | Sightings | Position | InitialPose):
                 number = len(item.sightings) or 1 if isinstance(item, Sightings) else 1
                 self.refused[input_name(item), refusal] += number
         return not refusal
+
+    def handle_from_elsewhere(
+        self, help_: Help, team: Collection[str], frame: str, now_ns: int
+    ) -> None:
+        """Takes help in another frame. In a better one the robot may find its pose by it, but only
+        by that of its `team`: no guest draws it away."""
+        frames, sender = self._frames, help_.observer if isinstance(help_, Fix) else help_.robot
+        is_of_use = frames is not None and sender in team
+        if not (is_of_use and frames and frames.add_help(help_, frame, self.timeline, now_ns)):
+            self.counts["other_frame"] += 1
+
+    def _change_frame(self, now_ns: int) -> list[FrameChanged]:
+        """Whether the robot goes on in another frame from now on."""
+        if self._frames is None:
+            return []
+        changed = self._frames.next_change(self.timeline, now_ns)
+        if changed is None:
+            return []
+        self.timeline, event, change = changed
+        self.counts[event] += 1
+        return [change]
 
     def _set_pose(self, given: InitialPose) -> None:
         """Sets the pose, unless neither a landmark nor a teammate that sees one could be seen from
@@ -190,7 +225,14 @@ class FilterAgent:
             if found is not None:
                 x, y, (xx, xy, yy) = found.position
                 places.append(LandmarkBelief(self._robot, name, now_ns, x, y, (xx, xy, yy)))
-        return [LandmarkPlaces(tuple(places))]
+        return [LandmarkPlaces(tuple(places), self.frame), *self._places_elsewhere()]
+
+    def _places_elsewhere(self) -> Iterator[LandmarkPlaces]:
+        """Where the shared landmarks are in better frames, as far as teammates have said."""
+        candidates = {} if self._frames is None else self._frames.candidates
+        for frame, candidate in candidates.items():
+            beliefs = candidate.timeline.state.memory.teammates.trusted_landmarks
+            yield LandmarkPlaces(tuple(beliefs.values()), frame)
 
     def _frame_estimates(self, now_ns: int) -> list[FrameEstimate]:
         """The estimate at each frame that odometry covers by now, or that waited long enough."""

@@ -9,6 +9,7 @@ that know a place each waits another time before it tells it, so that the first 
 
 import math
 import zlib
+from collections.abc import Iterable, Mapping
 from typing import Final
 
 from cpcbl_team.inputs import LandmarkBelief, Sightings
@@ -27,6 +28,15 @@ def landmark_tier(place: LandmarkBelief, rounding: float = 1.0) -> int:
     xx, _, yy = place.covariance
     sigma_m = math.sqrt(0.5 * (xx + yy)) / rounding
     return min(tier_of(sigma_m, TIER_WIDTH), UNKNOWN_TIER)
+
+
+def known_tiers(places: Iterable[LandmarkBelief]) -> dict[str, int]:
+    """The best tier in which each of these landmarks is known."""
+    known: dict[str, int] = {}
+    for place in places:
+        tier = landmark_tier(place, ROUNDING)
+        known[place.landmark] = min(tier, known.get(place.landmark, UNKNOWN_TIER))
+    return known
 
 
 class LandmarkSharing:
@@ -66,20 +76,24 @@ class LandmarkSharing:
         self._own = {place.landmark: place for place in places if place.robot == self._robot}
         tiers = {name: landmark_tier(place) for name, place in self._own.items()}
         self.tiers = {name: tier for name, tier in tiers.items() if tier < UNKNOWN_TIER}
-        known: dict[str, int] = {}
-        for place in places:
-            tier = landmark_tier(place, ROUNDING)
-            known[place.landmark] = min(tier, known.get(place.landmark, UNKNOWN_TIER))
-        self._known = known
+        self._known = known_tiers(places)
 
-    def wanted(self, now_ns: int) -> frozenset[tuple[str, int]]:
-        """The landmarks in sight, with the tiers in which the robot asks for their places."""
+    def wanted(
+        self, now_ns: int, known: Mapping[str, int] | None = None
+    ) -> frozenset[tuple[str, int]]:
+        """The landmarks in sight, with the tiers in which the robot asks for their places. `known`:
+        the tiers in which it knows them; None for what it knows in its own frame."""
+        known = self._known if known is None else known
         return frozenset(
             (name, tier)
             for name, seen_ns in self._seen_ns.items()
             if now_ns - seen_ns <= IN_SIGHT_NS
-            for tier in range(self._known.get(name, UNKNOWN_TIER))
+            for tier in range(known.get(name, UNKNOWN_TIER))
         )
+
+    def begin_frame(self) -> None:
+        """The robot's places are in another frame from now on."""
+        self._sent, self._own, self._known, self._asked_ns, self.tiers = {}, {}, {}, {}, {}
 
     def next_belief(self, now_ns: int) -> tuple[LandmarkBelief, int] | None:
         """What is to be sent next, if anything, and the time of the last belief about it (0: none).

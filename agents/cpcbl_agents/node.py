@@ -19,6 +19,7 @@ from cpcbl_agents.pose_output import PoseOutput
 from cpcbl_agents.robot import Robot
 from cpcbl_agents.tape import NO_TAPE, Tape
 from cpcbl_team.config import Team
+from cpcbl_team.frames import FIELD
 from cpcbl_team.inputs import Belief, Fix, LandmarkBelief
 from cpcbl_transport import messages, topics
 from cpcbl_transport.bus import Bus
@@ -113,8 +114,9 @@ class Node:
         self.arrivals, self._load = tape.arrivals(*named, callbacks.on_arrival), LoadMonitor(speed)
         robot.sensing.wrap(tape)
         put_message, put_token = self.arrivals.put_message, self.arrivals.put_token
+        is_agreed = team.map.frame == "agreed"
         self._declarations = Declarations(
-            robot.name, incarnation, rules, bus, put_message, put_token
+            robot.name, incarnation, rules, bus, put_message, put_token, is_agreed
         )
         self._pose = PoseOutput(robot, bus, team.robots[robot.name].pose_rate_hz, start_ns)
         self._tokens = LivelinessTokens()
@@ -129,6 +131,8 @@ class Node:
             bus.subscribe(topic.at(robot=robot.name), put_message)
         own_tokens = topics.ALIVE.at(robot=robot.name)
         bus.watch_liveliness(own_tokens, self.arrivals.put_own_name)
+        if is_agreed:
+            bus.watch_liveliness(topics.FRAME.at(), self.arrivals.put_token)
         tape.end()
 
     @property
@@ -204,7 +208,11 @@ class Node:
             return
         if source is not None and isinstance(message, SensorInput):
             source.take(message, now_ns)
-        self._send(self.robot.handle(message, now_ns), now_ns)
+        tier, frame = topics.tier_and_frame_of(key) if isinstance(message, Help) else ("", FIELD)
+        if tier == topics.ANY_TIER and frame == self._declarations.frame:  # it was in a worse one
+            self._counts["other_frame"] += 1
+            return
+        self._send(self.robot.handle(message, now_ns, frame), now_ns)
         match message:
             case Fix(observer=name):  # by a subscription to all observers
                 size = received_bytes(len(payload), name)
@@ -244,13 +252,12 @@ class Node:
 
     def _handle_token(self, key: str, alive: bool, now_ns: int) -> None:
         """Tells the robot which teammates are present, and with which tier."""
-        presence = self._tokens.update(key, alive)
-        if presence is None:
+        known = self._tokens.update(key, alive)
+        if known is None:
             self._counts["bad_token"] += 1
             return
-        name, tier = presence
-        was_guest = self.robot.is_guest(name)
-        self.robot.handle(agent.Presence(name, tier), now_ns)
+        name, was_guest = known.robot, self.robot.is_guest(known.robot)
+        self.robot.handle(known, now_ns)
         if was_guest is not self.robot.is_guest(name):
             log.info("%s: guest %s %s", self._name, name, "left" if was_guest else "joined")
 
@@ -258,7 +265,7 @@ class Node:
         self, topic: Topic, event: type[BeliefSubscribers | FrameSubscribers], now_ns: int
     ) -> None:
         """Tells the robot when the subscribers to what it publishes under a topic come or go."""
-        key = topic.at(tier=self._declarations.tier, robot=self._name)
+        key = topic.at(tier=self._declarations.tier_chunk, robot=self._name)
         subscribed = key if self._declarations.publisher(topic, key).matching else ""
         if subscribed != self._subscribed[event]:  # another key may have other subscribers
             self._subscribed[event] = subscribed
@@ -279,9 +286,14 @@ class Node:
 
     def _publish(self, message: Outgoing | Status) -> int:
         """Publishes if there is a subscriber; returns the bytes of the payload, 0 without one."""
-        topic, tier, landmark = topic_of(type(message)), self._declarations.tier, ""
-        if isinstance(message, LandmarkBelief):
-            landmark, tier = message.landmark, landmark_tier(message)
+        topic, landmark = topic_of(type(message)), ""
+        tier = self._declarations.tier_chunk
+        match message:
+            case LandmarkBelief():
+                landmark = message.landmark
+                tier = topics.tier_chunk(landmark_tier(message), self._declarations.frame)
+            case Fix():
+                tier = self.robot.collaboration.frames.fix_chunk(message.robot, tier)
         key = topic.at(tier=tier, robot=message.robot, observer=self._name, landmark=landmark)
         publisher = self._declarations.publisher(topic, key)
         if not publisher.matching:

@@ -162,17 +162,18 @@ def make_robot(
     log; one that ran before does not know what it spent."""
     start_ns = clock.now_ns()
     late_s = (start_ns - clock.epoch_ns) * 1e-9 / clock.speed
-    logged = team.robots[name].source == "mrclam"
+    logged, start = team.robots[name].source == "mrclam", team.robots[name].start
+    knows_start = start is not None and start.known
     late = logged and start_ns > clock.epoch_ns + LATE_NS * max(1.0, clock.speed)
     if late:
         log.warning("%s: begins %.1f s late in its log: it has to find its pose", name, late_s)
-    elif before.moved and team.robots[name].start is not None:
+    elif before.moved and knows_start:
         log.warning(
             "%s: has moved since the team started: it has to find its pose; --no-restarted: it"
             " stands at its start again",
             name,
         )
-    if late or before.moved:
+    if knows_start and (late or before.moved):
         robot = msgspec.structs.replace(team.robots[name], start=None)
         team = msgspec.structs.replace(team, robots={**team.robots, name: robot})
     return build_robot(name, team, start_ns, late or before.moved or before.ran, camera)

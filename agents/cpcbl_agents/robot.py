@@ -15,17 +15,20 @@ from cpcbl_agents.agent import AgentMessage, BusEvent, FrameSubscribers, HelpSen
 from cpcbl_agents.clocks import ClockMonitor
 from cpcbl_agents.collaboration import CollaborationAgent
 from cpcbl_agents.filtering import FilterAgent
+from cpcbl_agents.frame_candidates import RobotFrames
 from cpcbl_agents.guests import GuestRegistry
 from cpcbl_agents.landmark_sharing import LandmarkSharing
 from cpcbl_agents.sensing import SensingAgent
 from cpcbl_agents.sources import OwnCamera, Source
+from cpcbl_agents.teammate_frames import TeammateFrames
 from cpcbl_agents.waypoint_follower import WaypointFollower
 from cpcbl_team.common_error_filter import considers_camera
 from cpcbl_team.config import Team
 from cpcbl_team.estimate import Estimate
+from cpcbl_team.frames import FIELD, ORIGIN, FrameOrder, begins_frame, frame_name, knows_map
 from cpcbl_team.inputs import BeliefShared, InitialPose, InputsMended, SightingFault
 from cpcbl_team.recovery import rejected_of
-from cpcbl_team.state import CalibrationMemory, Jump
+from cpcbl_team.state import CalibrationMemory, Jump, pose_of
 from cpcbl_team.trust import TrustStatus
 from cpcbl_transport.budget import Budget
 from cpcbl_transport.messages import Flow, Help, Message, Outgoing, Pose, SensorInput, Status, Trust
@@ -69,8 +72,11 @@ class Robot:
         self.start = RobotStart(start_ns, team.robots[name].start is not None, restarted)
         camera = settings.camera if settings.sensing == "camera" else None
         shared = frozenset(team.map.unsurveyed)
+        frames = robot_frames(name, team, start_ns)
+        if begins_frame(team, name):
+            settings = replace(settings, start=ORIGIN)
         known = settings, team.map_of(name), teammates, start_ns
-        self.filter = FilterAgent(*known, camera, name, shared)
+        self.filter = FilterAgent(*known, camera, name, shared, frames)
         self._is_weighted = settings.localizer.variant == "weighted"  # it has no covariance
         self._sightings_input = "frame" if settings.sensing == "camera" else "sightings"
         match = team.messages_per_s(name), restarted, team.match.duration_s
@@ -78,11 +84,17 @@ class Robot:
         names = team.map.names | frozenset(team.robots)
         guests = GuestRegistry(names, team.guests.most if team.guests.allowed else 0)
         sharing = LandmarkSharing(name, shared, len(team.robots))
-        agent = name, settings, teammates, start_ns, budget, guests, sharing
+        mates = TeammateFrames(name, teammates, FrameOrder(team.robots))
+        mates.begin_frame(self.filter.frame)
+        agent = name, settings, teammates, start_ns, budget, guests, sharing, mates
         self.collaboration = CollaborationAgent(*agent)
+        self._teammates = teammates
 
-    def handle(self, message: Message | Tick | BusEvent, now_ns: int) -> list[Outgoing]:
+    def handle(
+        self, message: Message | Tick | BusEvent, now_ns: int, frame: str = FIELD
+    ) -> list[Outgoing]:
         """Everything that this robot publishes because of one message (from the bus, or a tick).
+        `frame`: in which a teammate's help is.
 
         Inputs go through sensing, filter and collaboration; the filter's estimates also go to the
         waypoint follower. After the end of its log a robot publishes nothing.
@@ -93,7 +105,10 @@ class Robot:
             self._handle_event(message, now_ns)
             return []
         if isinstance(message, Help):  # it changes what is published at the next tick
-            self.filter.handle(self.collaboration.as_used(message), now_ns)
+            if frame == self.filter.frame:
+                self.filter.handle(self.collaboration.as_used(message), now_ns)
+            else:
+                self.filter.handle_from_elsewhere(message, self._teammates, frame, now_ns)
             return []
         inputs: list[AgentMessage] = [] if isinstance(message, SensorInput) else [message]
         inputs += self.sensing.handle(message, now_ns)
@@ -149,7 +164,8 @@ class Robot:
         state = self.filter.timeline.latest(now_ns)
         (x_m, y_m, heading_rad), (xx, xy, yy, xh, yh, hh), _ = state.reported
         rows = None if self._is_weighted else ((xx, xy, xh), (xy, yy, yh), (xh, yh, hh))
-        return Pose(self.name, state.stamp_ns, x_m, y_m, heading_rad, rows, state.lost)
+        where = self.name, state.stamp_ns, x_m, y_m, heading_rad, rows, state.lost
+        return Pose(*where, frame=self.filter.frame)
 
     @property
     def next_ns(self) -> int:
@@ -204,6 +220,7 @@ class Robot:
             spending=self.collaboration.budget.spending(now_ns),
             trust=tuple(self._trust(now_ns, clocks)),
             places=self.filter.places,
+            frame=self.filter.frame,
         )
 
     def _trust(self, now_ns: int, clocks: ClockMonitor | None) -> Iterator[Trust]:
@@ -216,6 +233,15 @@ class Robot:
                 status = status._replace(reason="clock")
             late_s = 0.0 if clocks is None else clocks.late_s(name)
             yield Trust(*status[:5], late_s, status.contested)
+
+
+def robot_frames(name: str, team: Team, start_ns: int) -> RobotFrames | None:
+    """The frames of this robot; None in a team whose frame is that of the map."""
+    if team.map.frame != "agreed":
+        return None
+    frame = frame_name(name, start_ns) if begins_frame(team, name) else FIELD
+    order = FrameOrder(team.robots)
+    return RobotFrames(name, frame, order, team.map_of(name), knows_map(team, name))
 
 
 def build_robot(
@@ -246,7 +272,11 @@ def build_sensing(
     map_names = team.map.names
     follower = None
     if settings.source == "simulated":
-        follower = WaypointFollower(name, settings.waypoints_m, settings.speed_m_s)
+        goals = settings.waypoints_m
+        if begins_frame(team, name) and settings.start is not None:  # where it truly is
+            start_from_field = pose_of(settings.start).inverse()
+            goals = tuple(start_from_field.transform(x, y) for x, y in goals)
+        follower = WaypointFollower(name, goals, settings.speed_m_s)
     detector = correction = None
     if settings.sensing == "camera":
         from cpcbl_agents.vision.camera_correction import CameraCorrection

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from cpcbl_agents.input_diagnosis.problems import without_numbers
 from cpcbl_agents.robot_state import RobotState, robot_state
 from cpcbl_team.config import Team
+from cpcbl_team.frames import FIELD, frame_text
 from cpcbl_transport.messages import InputHealth, Status
 
 log = logging.getLogger(__name__)
@@ -21,6 +22,7 @@ class RobotLogger:
         self._fed: set[str] = set()
         self._heard: set[str] = set()
         self._lost: str | None = None
+        self._frame = FIELD
         self._unconfirmed = ""
         self._problems: dict[str, str] = {}
         self._initial_poses: Counter[str] = Counter()  # by the reason of a refusal
@@ -44,6 +46,9 @@ class RobotLogger:
             if flow.peer not in self._heard:
                 self._heard.add(flow.peer)
                 log.info("%s: first help from %s", self._robot, flow.peer)
+        if status.frame != self._frame:
+            self._frame = status.frame
+            log.info("%s: is in frame %s", self._robot, frame_text(status.frame))
         state = robot_state(status)
         lost = without_numbers(state.why) if state.word == "lost" else ""
         if lost != self._lost:

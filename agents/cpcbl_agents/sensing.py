@@ -7,7 +7,13 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
-from cpcbl_agents.agent import AgentMessage, FrameSubscribers, PoseEstimate, Tick
+from cpcbl_agents.agent import (
+    AgentMessage,
+    FrameChanged,
+    FrameSubscribers,
+    PoseEstimate,
+    Tick,
+)
 from cpcbl_agents.detection_worker import (
     DetectedFrame,
     Detection,
@@ -124,6 +130,9 @@ class SensingAgent:
                 return [*outgoing, *self._collect()]
             case Odometry() | Sightings() | Position() | InitialPose() | Frame():
                 return self._process(message)
+            case FrameChanged(_, new_from_old):
+                if self._follower is not None:
+                    self._follower.change_frame(new_from_old)
             case FrameSubscribers():
                 self._has_subscribers = message.present
             case PoseEstimate():

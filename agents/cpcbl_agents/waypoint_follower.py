@@ -29,6 +29,11 @@ class WaypointFollower:
         self._reached = 0
         self._commanded_ns = 0
 
+    def change_frame(self, new_from_old: Pose2 | None) -> None:
+        """The robot's poses are in another frame from now on; its goals stay where they are."""
+        if new_from_old is not None:
+            self._waypoints = tuple(new_from_old.transform(x, y) for x, y in self._waypoints)
+
     def command(self, now: PoseEstimate) -> list[Drive]:
         if not self._waypoints or now.stamp_ns < self._commanded_ns + COMMAND_NS:
             return []

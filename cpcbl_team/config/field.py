@@ -8,6 +8,7 @@ import msgspec
 from cpcbl_team.config.table import NotNegative, Positive, Table
 
 Gives = Literal["both", "range", "bearing", "none"]
+Frame = Literal["field", "agreed"]
 Bands = tuple[str, str]
 """The names of two colours, the upper one first."""
 
@@ -89,6 +90,9 @@ class Field(Table, frozen=True, kw_only=True):
     walls: dict[str, Wall] = msgspec.field(default_factory=dict)
     unsurveyed: dict[str, Unsurveyed] = msgspec.field(default_factory=dict)
     unsurveyed_walls: dict[str, UnsurveyedWall] = msgspec.field(default_factory=dict)
+    frame: Frame = "field"
+    """agreed: a robot that knows neither its start nor the map begins a frame of its own, and
+    robots that meet join the better one."""
 
     @property
     def names(self) -> frozenset[str]:

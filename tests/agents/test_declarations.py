@@ -7,6 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.buses import Subscription, TeamOnBus, examples, robot_at, saw, standing, team_of
 
+from cpcbl_agents.agent import Presence
 from cpcbl_agents.declarations import LivelinessTokens
 from cpcbl_agents.node import Node, NodeStart
 from cpcbl_agents.robot import build_robot
@@ -27,53 +28,53 @@ def alive(tier: object, robot: str = "mate", incarnation: object = 1) -> str:
 
 def test_a_teammate_is_there_until_its_token_goes() -> None:
     tokens = LivelinessTokens()
-    assert tokens.update(alive(7), True) == ("mate", 7)
-    assert tokens.update(alive(7), False) == ("mate", None)
+    assert tokens.update(alive(7), True) == Presence("mate", 7)
+    assert tokens.update(alive(7), False) == Presence("mate", None)
 
 
 def test_of_two_tokens_the_newest_counts() -> None:
     """At a change of tier the new one comes before the old one goes."""
     tokens = LivelinessTokens()
-    assert tokens.update(alive(7), True) == ("mate", 7)
-    assert tokens.update(alive(3), True) == ("mate", 3)
-    assert tokens.update(alive(7), False) == ("mate", 3)
-    assert tokens.update(alive(3), False) == ("mate", None)
+    assert tokens.update(alive(7), True) == Presence("mate", 7)
+    assert tokens.update(alive(3), True) == Presence("mate", 3)
+    assert tokens.update(alive(7), False) == Presence("mate", 3)
+    assert tokens.update(alive(3), False) == Presence("mate", None)
 
 
 def test_when_the_newest_token_goes_the_one_before_counts() -> None:
     tokens = LivelinessTokens()
     for tier in (7, 3, 5):
         tokens.update(alive(tier), True)
-    assert tokens.update(alive(5), False) == ("mate", 3)
+    assert tokens.update(alive(5), False) == Presence("mate", 3)
 
 
 def test_a_token_that_is_declared_again_is_the_newest() -> None:
     tokens = LivelinessTokens()
     for tier in (7, 3):
         tokens.update(alive(tier), True)
-    assert tokens.update(alive(7), True) == ("mate", 7)
+    assert tokens.update(alive(7), True) == Presence("mate", 7)
 
 
 def test_a_process_that_is_started_again_has_a_token_of_its_own() -> None:
     tokens = LivelinessTokens()
     tokens.update(alive(7, incarnation="a"), True)
-    assert tokens.update(alive(7, incarnation="b"), True) == ("mate", 7)
-    assert tokens.update(alive(7, incarnation="a"), False) == ("mate", 7)
+    assert tokens.update(alive(7, incarnation="b"), True) == Presence("mate", 7)
+    assert tokens.update(alive(7, incarnation="a"), False) == Presence("mate", 7)
 
 
 def test_the_tokens_of_teammates_do_not_mix() -> None:
     tokens = LivelinessTokens()
     tokens.update(alive(7), True)
-    assert tokens.update(alive(3, "other"), True) == ("other", 3)
-    assert tokens.update(alive(3, "other"), False) == ("other", None)
-    assert tokens.update(alive(7), True) == ("mate", 7)
+    assert tokens.update(alive(3, "other"), True) == Presence("other", 3)
+    assert tokens.update(alive(3, "other"), False) == Presence("other", None)
+    assert tokens.update(alive(7), True) == Presence("mate", 7)
 
 
 def test_a_token_that_disappears_without_having_appeared_changes_nothing() -> None:
     tokens = LivelinessTokens()
-    assert tokens.update(alive(7), False) == ("mate", None)
+    assert tokens.update(alive(7), False) == Presence("mate", None)
     tokens.update(alive(3), True)
-    assert tokens.update(alive(7), False) == ("mate", 3)
+    assert tokens.update(alive(7), False) == Presence("mate", 3)
 
 
 def test_what_is_forgotten_plays_no_part_any_more() -> None:
@@ -82,7 +83,7 @@ def test_what_is_forgotten_plays_no_part_any_more() -> None:
     tokens.forget("mate")
     tokens.forget("stranger")
     tokens.update(alive(3), True)
-    assert tokens.update(alive(3), False) == ("mate", None)
+    assert tokens.update(alive(3), False) == Presence("mate", None)
 
 
 STRANGE_TIERS = ["", "x", "-1", "16", "99", "1.0", "+3", " 3", "1e1", "³", "٣", "9" * 5000]
@@ -103,14 +104,15 @@ def test_a_key_that_is_no_robots_token_gives_none(key: str, there: bool) -> None
     tokens = LivelinessTokens()
     tokens.update(alive(7), True)
     assert tokens.update(key, there) is None
-    assert tokens.update(alive(7), True) == ("mate", 7)
+    assert tokens.update(alive(7), True) == Presence("mate", 7)
 
 
 @examples(200)
 @given(st.text(alphabet="alive/0123456789mate-*x", max_size=30), st.booleans())
 def test_no_key_raises(key: str, there: bool) -> None:
     presence = LivelinessTokens().update(key, there)
-    assert presence is None or presence[1] is None or 0 <= presence[1] <= LOWEST_TIER
+    assert isinstance(presence, Presence | None)
+    assert presence is None or presence.tier is None or 0 <= presence.tier <= LOWEST_TIER
 
 
 CHANGES = st.lists(
@@ -128,7 +130,9 @@ def test_the_newest_of_what_is_there_counts(changes: list[tuple[str, int, bool]]
         if comes:
             there.append((robot, tier))
         newest = [t for name, t in there if name == robot]
-        assert tokens.update(alive(tier, robot), comes) == (robot, newest[-1] if newest else None)
+        assert tokens.update(alive(tier, robot), comes) == Presence(
+            robot, newest[-1] if newest else None
+        )
 
 
 def test_invalid_tokens_are_counted_and_change_nothing() -> None:

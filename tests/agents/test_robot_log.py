@@ -60,3 +60,14 @@ def test_each_pose_that_somebody_gives_is_said(caplog: pytest.LogCaptureFixture)
         "r1: a pose that somebody gave is refused: off_field",
         "r1: somebody has set its pose",
     ]
+
+
+def test_each_change_of_frame_is_said(caplog: pytest.LogCaptureFixture) -> None:
+    logger = RobotLogger("r1")
+    with caplog.at_level(logging.INFO):
+        for seconds, frame in ((1.0, ""), (2.0, "r1.0000000"), (3.0, "r1.0000000"), (4.0, "")):
+            logger.log_status(status("r1", seconds, 3, frame=frame))
+    assert [record.message for record in caplog.records][1:] == [
+        "r1: is in frame r1.0000000",
+        "r1: is in frame field",
+    ]

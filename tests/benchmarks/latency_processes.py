@@ -26,6 +26,7 @@ from cpcbl_team.config import (
     Start,
     Team,
 )
+from cpcbl_team.frames import FIELD
 from cpcbl_team.inputs import Fix, Odometry, Sighting, Sightings
 from cpcbl_team.sensors import range_sigma_m
 from cpcbl_transport import topics
@@ -86,9 +87,11 @@ class TimingRobot(Robot):
         self.changed_ns: dict[int, int] = {}
         """When the belief changed, by the stamp of the fix."""
 
-    def handle(self, message: Message | Tick | BusEvent, now_ns: int) -> list[Outgoing]:
+    def handle(
+        self, message: Message | Tick | BusEvent, now_ns: int, frame: str = FIELD
+    ) -> list[Outgoing]:
         before = self.filter.timeline.state
-        outgoing = super().handle(message, now_ns)
+        outgoing = super().handle(message, now_ns, frame)
         if isinstance(message, Fix):
             after = self.filter.timeline.state  # which computes it
             at_ns = time.monotonic_ns()

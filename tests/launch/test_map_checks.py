@@ -13,6 +13,7 @@ from cpcbl_team.config import (
     LandmarkPosition,
     LocalizerSettings,
     RobotSettings,
+    SensorSettings,
     Start,
     Team,
     Unsurveyed,
@@ -123,6 +124,30 @@ def test_a_map_from_nothing_needs_a_start() -> None:
     assert list(warnings(team_of(**nothing))) == []
     (line,) = warnings(team_of(replace(ROBOT, start=None), **nothing))
     assert line.startswith("map.unsurveyed: no robot knows its start")
+    unknown = replace(ROBOT, start=Start(x_m=1.0, y_m=1.0, known=False))
+    assert list(warnings(team_of(unknown, **nothing))) == [line]
+    assert list(warnings(team_of(unknown, **nothing, frame="agreed"))) == []
+
+
+def test_a_frame_is_agreed_where_there_is_no_map_and_robots_have_covariances() -> None:
+    (line,) = problems(team_of(frame="agreed"))
+    assert line.startswith("map.frame: agreed is for a team without a map")
+    nothing: dict[str, Any] = {"landmarks": {}, "frame": "agreed"}
+    assert list(problems(team_of(**nothing))) == []
+    weighted = replace(ROBOT, localizer=LocalizerSettings(variant="weighted"))
+    (line,) = problems(team_of(weighted, **nothing))
+    assert line.startswith("robots.r1.localizer.variant: weighted knows no covariance")
+
+
+def test_what_links_two_frames_must_be_seen() -> None:
+    nothing: dict[str, Any] = {"landmarks": {}, "frame": "agreed"}
+    unseeing = replace(ROBOT, sensor=SensorSettings(sees_robots=False))
+    assert any(line.startswith("map.frame:") for line in warnings(team_of(unseeing, **nothing)))
+    for team in (
+        team_of(**nothing),
+        team_of(unseeing, **nothing, unsurveyed={"box": Unsurveyed()}),
+    ):
+        assert not any(line.startswith("map.frame:") for line in warnings(team))
 
 
 def test_a_sigma_in_millimetres_is_said() -> None:

@@ -58,11 +58,16 @@ CONFIRMED_STATUS = STATUS  # as robots sent it that did not know of unconfirmed 
 SURVEYED_STATUS = msgspec.structs.replace(STATUS, unconfirmed="it stood")
 """As robots sent it that found no landmarks themselves."""
 PLACES = (LandmarkEstimate("box", 2.0, 0.5, (0.01, 0.0, 0.02)),)
-STATUS = msgspec.structs.replace(SURVEYED_STATUS, places=PLACES)
-TRACK = Track("r1", NOW, 1.0, 2.0, 0.5, COVARIANCE, 3)
+FIELD_STATUS = msgspec.structs.replace(SURVEYED_STATUS, places=PLACES)
+"""As robots sent it that knew no frame but that of the field."""
+OWN_FRAME = "r1.00000k3"
+STATUS = msgspec.structs.replace(FIELD_STATUS, frame=OWN_FRAME)
+FIELD_TRACK = Track("r1", NOW, 1.0, 2.0, 0.5, COVARIANCE, 3)
+TRACK = msgspec.structs.replace(FIELD_TRACK, frame=OWN_FRAME)
 ROWS = ((0.04, 0.01, 0.0), (0.01, 0.09, 0.0), (0.0, 0.0, 0.01))
 CONFIRMED_POSE = Pose("r1", NOW, 1.0, 2.0, 0.5, ROWS, "kidnapped")
-POSE = msgspec.structs.replace(CONFIRMED_POSE, unconfirmed="it stood")
+FIELD_POSE = msgspec.structs.replace(CONFIRMED_POSE, unconfirmed="it stood")
+POSE = msgspec.structs.replace(FIELD_POSE, frame=OWN_FRAME)
 DRIVE = Drive("r1", NOW, 0.5, 0.1)
 MODEL = SimulatedRobotModel(StartModel(x_m=1.0, y_m=2.0), position_sensor=PositionSensorModel())
 JOIN = Join("tripod", "a", NOW, MODEL)

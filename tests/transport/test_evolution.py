@@ -19,8 +19,11 @@ from cpcbl_transport.messages import (
     Help,
     Join,
     Message,
+    Pose,
     Refusal,
+    Status,
     Tagged,
+    Track,
     decode_tagged,
     encode,
     model_from_settings,
@@ -171,6 +174,21 @@ def test_a_status_and_a_pose_without_unconfirmed_are_still_understood() -> None:
 def test_a_status_without_places_is_still_understood() -> None:
     golden = bytes.fromhex(GOLDEN["status without places"])
     assert decode_tagged(golden) == samples.SURVEYED_STATUS
+
+
+@pytest.mark.parametrize(
+    ("name", "due"),
+    [
+        ("status", samples.FIELD_STATUS),
+        ("track", samples.FIELD_TRACK),
+        ("pose", samples.FIELD_POSE),
+    ],
+)
+def test_a_message_without_frame_is_in_that_of_the_field(name: str, due: Tagged) -> None:
+    message = decode_tagged(bytes.fromhex(GOLDEN[f"{name} without frame"]))
+    assert message == due
+    assert isinstance(message, Status | Track | Pose)
+    assert message.frame == ""
 
 
 def test_a_status_without_inputs_is_still_understood() -> None:

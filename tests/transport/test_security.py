@@ -214,6 +214,7 @@ def test_permitted_subscriptions_follow_the_table_too() -> None:
     assert set(subscribe_keys(me)) == {
         *(
             "alive/*/*/*",
+            "frame/*/*/*",
             "belief/*/*",
             "fix/me/*/*",
             "landmark/*/*/*",

@@ -143,6 +143,7 @@ def decode_help(key: str, payload: bytes) -> Help | Refusal:
 
 
 _is_name = re.compile(NAME_PATTERN).fullmatch
+_is_tier = re.compile(r"[A-Za-z0-9_.-]{1,32}(~[A-Za-z0-9_.-]{1,64})?").fullmatch
 
 
 @lru_cache(maxsize=4096)
@@ -152,7 +153,8 @@ def _names_in(key: str) -> dict[str, str] | Refusal:
     names = next(filter(None, found), None)
     if names is None:
         return Refusal.WRONG_TYPE
-    return names if all(map(_is_name, names.values())) else Refusal.UNKNOWN_ROBOT
+    are_names = all(_is_name(v) for n, v in names.items() if n != "tier")
+    return names if are_names and _is_tier(names["tier"]) else Refusal.UNKNOWN_ROBOT
 
 
 def _pack(numbers: Sequence[_Number], counts: Sequence[int]) -> bytes:

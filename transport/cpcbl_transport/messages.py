@@ -152,10 +152,11 @@ class Status(msgspec.Struct, frozen=True, array_like=True, tag="status"):
     problems: tuple[str, ...] = ()
     """What is wrong with the inputs, as sentences for people, the worst first."""
     unconfirmed: str = ""
-    """What is not confirmed about the pose, and why; the state is then not ok. Empty while the
-    robot is lost."""
+    """What is not confirmed about the pose: the state is then not ok. Empty while it is lost."""
     places: tuple[LandmarkEstimate, ...] = ()
     """The landmarks that the robot estimates beside its pose, as far as it has seen them."""
+    frame: str = ""
+    """In which its pose and these places are; empty for that of the field."""
 
 
 class Track(msgspec.Struct, frozen=True, array_like=True, tag="track"):
@@ -169,18 +170,20 @@ class Track(msgspec.Struct, frozen=True, array_like=True, tag="track"):
     covariance: tuple[float, float, float, float, float, float] | None
     tier: int
     lost: str = ""
+    frame: str = ""  # of the pose; empty for that of the field
 
 
 Row3 = tuple[float, float, float]
 
 
 class Pose(msgspec.Struct, frozen=True, array_like=True, tag="pose"):
-    """Where a robot is in the field's frame, for its own software and for people.
+    """Where a robot is, for its own software and for people.
 
     `stamp_ns`: the time for which it holds, that of the newest odometry. `covariance`: rows of x, y
     and heading (m^2, m rad, rad^2); None where the variant has none. `lost`: why the robot is lost,
     empty while it is not; the pose of a lost robot is not to be used. `unconfirmed`: what is
-    not confirmed about the pose, and why; else empty.
+    not confirmed about the pose, and why; else empty. `frame`: in which the pose is; empty for that
+    of the field.
     """
 
     robot: Name
@@ -191,6 +194,7 @@ class Pose(msgspec.Struct, frozen=True, array_like=True, tag="pose"):
     covariance: tuple[Row3, Row3, Row3] | None
     lost: str = ""
     unconfirmed: str = ""
+    frame: str = ""
 
 
 class Drive(msgspec.Struct, frozen=True, array_like=True, tag="drive"):

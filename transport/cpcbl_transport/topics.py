@@ -24,6 +24,8 @@ from cpcbl_transport import messages
 from cpcbl_transport.messages import LARGEST_FRAME, LARGEST_PAYLOAD, Message
 
 JSON_CHUNK = "/json"
+IN_FRAME_MARK = "~"  # in the chunk of a tier, before the name of the frame that it is in
+ANY_TIER = "any"  # in its place: for robots that are in worse frames, to which all tiers are better
 
 
 class QosProfile(NamedTuple):
@@ -113,6 +115,25 @@ def json_key(key: str) -> str:
     return key + JSON_CHUNK
 
 
+def tier_chunk(tier: int | str, frame: str) -> str:
+    """The tier of a key, with the frame in which it is; that of the field has no name."""
+    return f"{tier}{IN_FRAME_MARK}{frame}" if frame else str(tier)
+
+
+def tier_and_frame(chunk: str) -> tuple[str, str]:
+    """The inverse of `tier_chunk`."""
+    tier, _, frame = chunk.partition(IN_FRAME_MARK)
+    return tier, frame
+
+
+@lru_cache(maxsize=4096)
+def tier_and_frame_of(key: str) -> tuple[str, str]:
+    """The tier and the frame in a key of help; empty for any other key."""
+    found = (topic.names(key) for topic in (BELIEF, FIX, LANDMARK))
+    names = next(filter(None, found), None)
+    return ("", "") if names is None else tier_and_frame(names["tier"])
+
+
 def is_json_key(key: str) -> bool:
     """Whether messages under this key are JSON."""
     return key.endswith(JSON_CHUNK)
@@ -140,6 +161,9 @@ def namespace(team: str) -> str:
 # At a change of tier. A liveliness token: the bus reports when it appears and disappears; it shows
 # presence, not health
 ALIVE = Topic("alive/<tier>/<robot>/<incarnation>", None, Qos.COMMAND, subscribers=_MEMBERS)
+# At a change of frame, in a team whose frame is agreed: so teammates know in which frames help may
+# come, and whose. A liveliness token
+FRAME = Topic("frame/<frame>/<robot>/<incarnation>", None, Qos.COMMAND, subscribers=_MEMBERS)
 # Twice in the life of a process: at its start (still), and when its robot has moved (moved). A
 # liveliness token, which the router repeats as long as it lives: a robot that is started again
 # after it has moved is not at its start
@@ -190,7 +214,7 @@ JOIN = Topic(
 TRUTH = Topic("field/truth", messages.Truths, Qos.TELEMETRY, publishers=_FIELD, subscribers=())
 
 TOPICS = (
-    *(ALIVE, RAN, BELIEF, FIX, LANDMARK, STATUS, TRACK, POSE),
+    *(ALIVE, FRAME, RAN, BELIEF, FIX, LANDMARK, STATUS, TRACK, POSE),
     *(IN_ODOMETRY, IN_SIGHTINGS, IN_POSITION, IN_INITIAL_POSE, IN_FRAME, LOOK),
     *(DRIVE, JOIN, TRUTH),
 )

@@ -51,9 +51,18 @@ _MODULES = (
     *(
         f"cpcbl_agents.{name}"
         for name in (
-            *("agent", "clocks", "collaboration", "declarations", "filtering", "guests"),
+            *(
+                "agent",
+                "clocks",
+                "collaboration",
+                "declarations",
+                "filtering",
+                "frame_candidates",
+                "guests",
+            ),
             *(
                 "input_diagnosis.",
+                "interests",
                 "landmark_sharing",
                 "load",
                 "message_counters",
@@ -61,6 +70,7 @@ _MODULES = (
                 "pose_output",
                 "robot",
                 "sensing",
+                "teammate_frames",
             ),
             *("vision.camera_check", "vision.camera_correction", "waypoint_follower"),
         )

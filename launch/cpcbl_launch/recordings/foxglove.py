@@ -32,10 +32,12 @@ from google.protobuf.message import Message as Protobuf
 from google.protobuf.timestamp_pb2 import Timestamp
 
 from cpcbl_launch.reporting.events import Event, EventLog
+from cpcbl_launch.reporting.frames import FrameOrigins
 from cpcbl_launch.reporting.metrics import ellipse_of
 from cpcbl_launch.reporting.recorded_file import CAMERAS
 from cpcbl_launch.reporting.statuses import current_help
 from cpcbl_team.config import Team
+from cpcbl_team.frames import frame_text
 from cpcbl_transport.messages import (
     AnnotatedFrame,
     LandmarkEstimate,
@@ -45,7 +47,7 @@ from cpcbl_transport.messages import (
     Truths,
 )
 
-FIELD = "field"
+FIELD = frame_text("")
 SCENE_NS, TRAIL_NS, TRUTH_NS = 200_000_000, 1_000_000_000, 100_000_000  # between two of a robot
 TRAIL_LENGTH = 30
 HELP_SHOWN = Duration(seconds=2)
@@ -79,6 +81,7 @@ class FoxgloveRun:
         self._robots: dict[str, _Robot] = {}
         self._events = EventLog()
         self._truth_ns = -TRUTH_NS
+        self._origins = FrameOrigins()
         for name in sorted(team.robots):
             self._robot(name)
 
@@ -111,12 +114,16 @@ class FoxgloveRun:
         yield from map(_log, self._events.events(at_ns, message))
         match message:
             case Track():
+                self._origins.note_track(message)
                 yield from self._of_track(at_ns, message)
             case Status():
                 yield from self._of_status(at_ns, message)
-            case Truths() if at_ns - self._truth_ns >= TRUTH_NS:
-                self._truth_ns = at_ns
-                yield from _of_truths(at_ns, message)
+            case Truths():
+                self._origins.note_truths(message)
+                if at_ns - self._truth_ns >= TRUTH_NS:
+                    self._truth_ns = at_ns
+                    yield from _of_truths(at_ns, message)
+                    yield from self._of_origins(at_ns)
             case AnnotatedFrame() if message.image:
                 image = CompressedImage(
                     timestamp=_stamp(at_ns),
@@ -131,16 +138,35 @@ class FoxgloveRun:
             self._robots[name] = _Robot(PALETTE[len(self._robots) % len(PALETTE)])
         return self._robots[name]
 
+    def _of_origins(self, at_ns: int) -> Iterator[FoxgloveMessage]:
+        """Where the frames that robots began are, as far as the truth tells. Of others there is no
+        transform: nobody knows how they lie to each other."""
+        found = [
+            FrameTransform(
+                timestamp=_stamp(at_ns),
+                parent_frame_id=FIELD,
+                child_frame_id=frame,
+                translation=pose.position,
+                rotation=pose.orientation,
+            )
+            for frame, origin in self._origins.field_from_frame.items()
+            if frame and (pose := _pose(*origin))
+        ]
+        if found:
+            yield FoxgloveMessage("/tf", FrameTransforms(transforms=found))
+
     def _of_track(self, at_ns: int, track: Track) -> Iterator[FoxgloveMessage]:
-        robot, stamp = self._robot(track.robot), _stamp(at_ns)
+        robot, stamp, frame = self._robot(track.robot), _stamp(at_ns), frame_text(track.frame)
+        if robot.track is not None and robot.track.frame != track.frame:
+            robot.trail.clear()  # of another frame
         robot.track = track
         pose, at = _pose(track.x_m, track.y_m, track.heading_rad), f"/robots/{track.robot}"
         yield FoxgloveMessage(
-            "/tf", FrameTransforms(transforms=[_transform(stamp, track.robot, pose)])
+            "/tf", FrameTransforms(transforms=[_transform(stamp, track.robot, pose, frame)])
         )
-        yield FoxgloveMessage(f"{at}/pose", PoseInFrame(timestamp=stamp, frame_id=FIELD, pose=pose))
+        yield FoxgloveMessage(f"{at}/pose", PoseInFrame(timestamp=stamp, frame_id=frame, pose=pose))
         uncertain = Odometry(
-            timestamp=stamp, frame_id=FIELD, body_frame_id=_frame(track.robot), pose=pose
+            timestamp=stamp, frame_id=frame, body_frame_id=_frame(track.robot), pose=pose
         )
         if track.covariance is not None:
             uncertain.pose_covariance.extend(_covariance_6x6(*track.covariance))
@@ -154,7 +180,7 @@ class FoxgloveRun:
             robot.trail_ns = at_ns
             robot.trail.append(Point3(x=track.x_m, y=track.y_m))
             trail = _line(list(robot.trail), 0.03, robot.colour, 0.6)
-            entity = SceneEntity(timestamp=stamp, frame_id=FIELD, id="trail", lines=[trail])
+            entity = SceneEntity(timestamp=stamp, frame_id=frame, id="trail", lines=[trail])
             yield FoxgloveMessage(f"{at}/trail", SceneUpdate(entities=[entity]))
 
     def _of_status(self, at_ns: int, status: Status) -> Iterator[FoxgloveMessage]:
@@ -166,17 +192,17 @@ class FoxgloveRun:
         if arrows:
             yield FoxgloveMessage("/help", SceneUpdate(entities=arrows))
         if status.places:
-            found = [self._place_entity(at_ns, status.robot, place) for place in status.places]
+            found = [self._place_entity(at_ns, status, place) for place in status.places]
             at = f"/robots/{status.robot}/places"
             yield FoxgloveMessage(at, SceneUpdate(entities=found))
 
-    def _place_entity(self, at_ns: int, robot: str, place: LandmarkEstimate) -> SceneEntity:
+    def _place_entity(self, at_ns: int, status: Status, place: LandmarkEstimate) -> SceneEntity:
         """A disc of 3 sigma for a landmark that a robot finds itself."""
         major, minor, turn = ellipse_of(*place.covariance)
-        colour, at = self._robot(robot).colour, (place.x_m, place.y_m)
+        colour, at = self._robot(status.robot).colour, (place.x_m, place.y_m)
         return SceneEntity(
             timestamp=_stamp(at_ns),
-            frame_id=FIELD,
+            frame_id=frame_text(status.frame),
             id=f"landmark/{place.landmark}",
             cylinders=[_disc(*at, 3.0 * major, 3.0 * minor, turn, 0.02, _colour(colour, 0.4))],
             texts=[_text(place.landmark, *at, colour)],
@@ -185,7 +211,7 @@ class FoxgloveRun:
     def _help_entity(self, at_ns: int, helper: str, helped: str, topic: str) -> SceneEntity | None:
         """A line with a head from a helper to the robot that it helps."""
         robot, other = self._robot(helper), self._robot(helped)
-        if robot.track is None or other.track is None:
+        if robot.track is None or other.track is None or robot.track.frame != other.track.frame:
             return None
         x, y, to_x, to_y = robot.track.x_m, robot.track.y_m, other.track.x_m, other.track.y_m
         turned, head = math.atan2(to_y - y, to_x - x), 0.25
@@ -196,7 +222,7 @@ class FoxgloveRun:
         tip = Point3(x=to_x, y=to_y)
         return SceneEntity(
             timestamp=_stamp(at_ns),
-            frame_id=FIELD,
+            frame_id=frame_text(robot.track.frame),
             id=f"{helper} helps {helped} by {topic}",
             lifetime=HELP_SHOWN,
             lines=[_line([Point3(x=x, y=y), tip, barbs[0], barbs[1], tip], 0.02, robot.colour)],
@@ -206,7 +232,7 @@ class FoxgloveRun:
 def _of_truths(at_ns: int, truths: Truths) -> Iterator[FoxgloveMessage]:
     stamp = _stamp(at_ns)
     poses = {t.robot: _pose(t.x_m, t.y_m, t.heading_rad) for t in truths.robots}
-    transforms = [_transform(stamp, name, pose, "truth") for name, pose in poses.items()]
+    transforms = [_transform(stamp, name, pose, FIELD, "truth") for name, pose in poses.items()]
     yield FoxgloveMessage("/tf", FrameTransforms(transforms=transforms))
     there = PosesInFrame(timestamp=stamp, frame_id=FIELD, poses=poses.values())
     yield FoxgloveMessage("/truth/poses", there)
@@ -215,7 +241,7 @@ def _of_truths(at_ns: int, truths: Truths) -> Iterator[FoxgloveMessage]:
 def _robot_entity(stamp: Timestamp, track: Track, robot: _Robot) -> SceneEntity:
     """The robot with its name, and the ellipse of 3 sigma where it states a covariance."""
     colour = LOST if track.lost else robot.colour
-    entity = SceneEntity(timestamp=stamp, frame_id=FIELD, id="robot")
+    entity = SceneEntity(timestamp=stamp, frame_id=frame_text(track.frame), id="robot")
     x, y, heading = track.x_m, track.y_m, track.heading_rad
     outline = [
         Point3(x=x + r * math.cos(heading + a), y=y + r * math.sin(heading + a))
@@ -266,10 +292,12 @@ def _pose(x_m: float, y_m: float, heading_rad: float) -> Pose:
     return Pose(position=Vector3(x=x_m, y=y_m), orientation=turned)
 
 
-def _transform(stamp: Timestamp, robot: str, pose: Pose, kind: str = "robot") -> FrameTransform:
+def _transform(
+    stamp: Timestamp, robot: str, pose: Pose, frame: str, kind: str = "robot"
+) -> FrameTransform:
     return FrameTransform(
         timestamp=stamp,
-        parent_frame_id=FIELD,
+        parent_frame_id=frame,
         child_frame_id=f"{kind}/{robot}",
         translation=pose.position,
         rotation=pose.orientation,

@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 from cpcbl_agents.input_diagnosis.problems import without_numbers
 from cpcbl_agents.robot_state import Severity, robot_state
+from cpcbl_team.frames import FIELD, frame_text
 from cpcbl_transport.messages import Message, Status, Track
 
 
@@ -40,6 +41,9 @@ class EventLog:
         if isinstance(message, Track):
             before = robot.track
             robot.track = message
+            if message.frame != (FIELD if before is None else before.frame):
+                frame = frame_text(message.frame)
+                yield Event(at_ns, message.robot, f"is in frame {frame}", "good")
             if before is not None and before.lost == message.lost:
                 return
         else:

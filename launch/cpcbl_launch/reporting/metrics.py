@@ -4,13 +4,15 @@ A TUM file, which evo reads, has a line a pose: `timestamp tx ty tz qx qy qz qw`
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
+
+from cpcbl_transport.messages import Track
 
 Floats = NDArray[np.float64]
 Stamps = NDArray[np.int64]
@@ -226,3 +228,15 @@ def write_tum(path: Path, stamps_ns: Stamps, poses: Floats) -> None:
         for ns, (x, y, heading) in zip(stamps_ns.tolist(), poses.tolist(), strict=True)
     ]
     path.write_text("".join(lines), encoding="ascii")
+
+
+def longest_lost_s(tracks: Iterable[Track]) -> float:
+    """The longest time (s) for which a robot was lost without a break."""
+    longest_ns, since_ns = 0, None
+    for track in tracks:
+        if not track.lost:
+            since_ns = None
+            continue
+        since_ns = track.stamp_ns if since_ns is None else since_ns
+        longest_ns = max(longest_ns, track.stamp_ns - since_ns)
+    return longest_ns * 1e-9

@@ -62,13 +62,18 @@ def robot_path(
 ) -> RobotPath:
     """A robot's estimates within a run that began at `begin_s`; `truth` as rows of s, x, y,
     heading. There may be none."""
-    tracks = list(recorder.tracks.get(name, ()))
+    tracks = list(recorder.tracks_in_field(name))
+    shown = recorder.shown_frame
+    truth = None if shown else truth  # nobody knows where that frame is
     times_s = np.array([t.stamp_ns for t in tracks], dtype=np.float64) * 1e-9 - begin_s
     inside = (times_s >= -MARGIN_S) & (times_s <= duration_s + MARGIN_S)
     kept = np.flatnonzero(inside)[np.argsort(times_s[inside], kind="stable")]
     unknown = (np.nan,) * 6
     covariances = np.array([t.covariance or unknown for t in tracks]).reshape(-1, 6)
-    poses = np.array([(t.x_m, t.y_m, t.heading_rad) for t in tracks]).reshape(-1, 3)[kept]
+    elsewhere = (np.nan,) * 3  # nobody knows where that is in the frame of the others
+    poses = np.array(
+        [(t.x_m, t.y_m, t.heading_rad) if t.frame == shown else elsewhere for t in tracks]
+    ).reshape(-1, 3)[kept]
     lost = [tracks[i].lost for i in kept]
     reasons = sorted({r for r in lost if r}, key=lambda r: -lost.count(r))
     return RobotPath(

@@ -3,13 +3,14 @@
 import math
 import threading
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 import msgspec
 import numpy as np
 
 from cpcbl_launch.reporting.activity import ActivityLog
 from cpcbl_launch.reporting.encoded_log import BlockFile, EncodedLog
+from cpcbl_launch.reporting.frames import FrameOrigins, main_frame
 from cpcbl_launch.reporting.metrics import (
     ErrorFigures,
     Floats,
@@ -17,6 +18,7 @@ from cpcbl_launch.reporting.metrics import (
     Score,
     Trajectory,
     interpolated_truth,
+    longest_lost_s,
     samples_with_truth,
     score,
     seconds,
@@ -82,6 +84,7 @@ class RobotReport(Score, frozen=True, kw_only=True):
     """Teammates whose messages it received at the end, or that were in quarantine."""
     inputs: tuple[InputReport, ...] = ()  # of its last process
     problems: tuple[ProblemReport, ...] = ()  # of its inputs
+    frame: str = ""  # in which it was at the end; empty for that of the field
     inputs_taken: int | None = None
     """Odometry, sightings, positions and frames that it received; None where no status tells."""
     sigma_rms_m: float | None = None
@@ -183,6 +186,7 @@ class Recorder:
         self.activity: dict[str, ActivityLog] = {}
         self.counts: Counter[str] = Counter()
         """Accepted messages by topic, and refused ones by reason."""
+        self.origins = FrameOrigins()
         self._problems: dict[str, ProblemLog] = {}
         self._processes: dict[str, dict[str, Status]] = {}  # the last status by incarnation
         if bus is not None:
@@ -205,6 +209,7 @@ class Recorder:
             self.counts[key.partition("/")[0] if is_accepted else str(message)] += 1
             match message:
                 case Track():
+                    self.origins.note_track(message)
                     self.tracks.setdefault(message.robot, EncodedLog(self._file)).append(payload)
                 case Status():
                     self.status[message.robot] = message
@@ -215,6 +220,7 @@ class Recorder:
                     if len(processes) > MOST_PROCESSES:
                         del processes[next(iter(processes))]
                 case Truths():
+                    self.origins.note_truths(message)
                     self.truths.append(payload)
 
     def _has_room(self, name: str) -> bool:
@@ -243,7 +249,11 @@ class Recorder:
         """The position error of every robot's newest estimate for whose time truth is known."""
         with self._lock:
             truth = truth_rows(self.truths.recent())
-            tracks = {name: log.recent() for name, log in self.tracks.items() if name in truth}
+            tracks = {
+                name: [t for track in log.recent() if not (t := self.origins.in_field(track)).frame]
+                for name, log in self.tracks.items()
+                if name in truth
+            }
         errors_m = {}
         for name, recent in tracks.items():
             rows = truth[name]
@@ -258,9 +268,21 @@ class Recorder:
         """Rows of seconds, x, y, heading for every robot of the simulated field."""
         return truth_rows(self.truths)
 
+    def tracks_in_field(self, robot: str) -> Iterator[Track]:
+        """A robot's tracks, in the field's frame where their own is known there."""
+        return map(self.origins.in_field, self.tracks.get(robot, ()))
+
+    @property
+    def shown_frame(self) -> str:
+        """The frame in which robots are drawn: the field's, or else that in which most are."""
+        last = {name: self.origins.in_field(log.last).frame for name, log in self.tracks.items()}
+        return main_frame(last)
+
     def trajectory(self, robot: str, from_s: float = -np.inf) -> Trajectory:
-        """A robot's estimates from `from_s` on."""
-        tracks = [t for t in self.tracks.get(robot, ()) if from_s <= t.stamp_ns * 1e-9]
+        """A robot's estimates from `from_s` on. Where there is a truth, those in frames that are
+        unknown beside it are left out."""
+        own = (t for t in self.tracks_in_field(robot) if from_s <= t.stamp_ns * 1e-9)
+        tracks = [t for t in own if not (t.frame and self.origins.has_truth)]
         covariance = None
         if all(t.covariance is not None for t in tracks):
             covariance = np.array([t.covariance for t in tracks]).reshape(-1, 6)
@@ -283,6 +305,7 @@ class Recorder:
         self, variants: Mapping[str, str], truth: Mapping[str, Floats], from_s: float = -np.inf
     ) -> Report:
         """The figures of all robots from `from_s` on."""
+        self.origins.locate(truth)
         robots = {
             name: self.robot_report(name, variant, truth.get(name), from_s)
             for name, variant in variants.items()
@@ -313,8 +336,9 @@ class Recorder:
             **msgspec.structs.asdict(figures),
             variant=variant,
             lost_share=float(np.mean([bool(t.lost) for t in tracks])) if tracks else 1.0,
-            longest_lost_s=_longest_lost_s(tracks),
+            longest_lost_s=longest_lost_s(tracks),
             lost_at_end=tracks[-1].lost if tracks else NOT_HEARD,
+            frame=tracks[-1].frame if tracks else "",
             bumps=last_truth[name].bumps if name in last_truth else 0,
             messages_sent=sum(s.messages_sent for s in statuses),
             bytes_sent=sum(s.bytes_sent for s in statuses),
@@ -346,17 +370,6 @@ def truth_rows(truths: Iterable[Truths]) -> dict[str, Floats]:
         for t in at.robots:
             rows.setdefault(t.robot, []).append((at.stamp_ns * 1e-9, t.x_m, t.y_m, t.heading_rad))
     return {name: np.array(r) for name, r in rows.items()}
-
-
-def _longest_lost_s(tracks: list[Track]) -> float:
-    longest_ns, since_ns = 0, None
-    for track in tracks:
-        if not track.lost:
-            since_ns = None
-            continue
-        since_ns = track.stamp_ns if since_ns is None else since_ns
-        longest_ns = max(longest_ns, track.stamp_ns - since_ns)
-    return longest_ns * 1e-9
 
 
 def _learned_report(statuses: Sequence[Status]) -> LearnedReport | None:

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from cpcbl_team.common_error_filter import considers_common_errors
 from cpcbl_team.config import LandmarkPosition, Team
 from cpcbl_team.errors import nearest_name
+from cpcbl_team.frames import knows_field
 
 LARGEST_SHARE = 0.25  # of the map's size, that its own errors may have
 
@@ -16,6 +17,7 @@ def map_problems(team: Team) -> Iterator[str]:
     names = [*field.landmarks, *field.unsurveyed, *field.walls, *field.unsurveyed_walls]
     for twice in sorted({n for n in names if names.count(n) > 1 or n in team.robots}):
         yield f"map: {twice!r} names two things; rename one of them"
+    yield from _frame_problems(team)
     for name, wall in team.map.walls.items():
         if wall.from_m == wall.to_m:
             yield f"map.walls.{name}: has no length; move to_m away from from_m"
@@ -44,6 +46,22 @@ def map_problems(team: Team) -> Iterator[str]:
             )
 
 
+def _frame_problems(team: Team) -> Iterator[str]:
+    if team.map.frame != "agreed":
+        return
+    if team.map.landmarks or team.map.walls:
+        yield (
+            "map.frame: agreed is for a team without a map, and every robot knows the landmarks and"
+            " walls of this one; remove the key"
+        )
+    for name, robot in team.robots.items():
+        if robot.localizer.variant == "weighted":
+            yield (
+                f"robots.{name}.localizer.variant: weighted knows no covariance, without which no"
+                " robot can join a frame; use variant joint"
+            )
+
+
 def _covariance_problems(key: str, mark: LandmarkPosition) -> Iterator[str]:
     if mark.covariance_m2 is None:
         return
@@ -64,6 +82,13 @@ def map_warnings(team: Team) -> Iterator[str]:
                 f"map.landmarks.{name}.sigma_m: {mark.sigma_m:g} m is a large part of a map of"
                 f" {size_m:.1f} m; if it is in millimetres, write {1e-3 * mark.sigma_m:g}"
             )
+    is_agreed = team.map.frame == "agreed"
+    links = team.map.unsurveyed or any(r.sensor.sees_robots for r in team.robots.values())
+    if is_agreed and not links:
+        yield (
+            "map.frame: robots see neither each other nor landmarks, so nobody joins another's"
+            " frame; name landmarks in map.unsurveyed, or set sensor.sees_robots = true"
+        )
     if not team.map.unsurveyed:
         return
     for name, robot in team.robots.items():
@@ -73,11 +98,9 @@ def map_warnings(team: Team) -> Iterator[str]:
                 f"robots.{name}.localizer.variant: {robot.localizer.variant} does not find"
                 " landmarks that nobody has surveyed; use variant joint"
             )
-    has_frame = bool(team.map.landmarks or team.map.walls)
-    knows = (r.start or r.position_sensor or r.known_landmarks for r in team.robots.values())
-    has_frame = has_frame or any(knows)
+    has_frame = is_agreed or any(knows_field(team, name) for name in team.robots)
     if not has_frame and all(robot.source != "mrclam" for robot in team.robots.values()):
         yield (
             "map.unsurveyed: no robot knows its start, and nothing else is on the map, so robots"
-            " stay lost; give a robot a start"
+            ' stay lost; give a robot a start, or write frame = "agreed" in [map]'
         )

@@ -8,6 +8,7 @@ from rich.console import Group, RenderableType
 from rich.text import Text
 
 from cpcbl_agents.robot_state import SEVERITIES, Word, robot_state
+from cpcbl_launch.reporting.frames import frames_text
 from cpcbl_launch.reporting.statuses import (
     FlowReport,
     SpendingReport,
@@ -21,6 +22,7 @@ from cpcbl_launch.team.faults import one_line
 from cpcbl_launch.views.listening import InputHeard, TeamHeard, clock_problem
 from cpcbl_launch.views.traffic_tables import limit_text
 from cpcbl_team.config import Team
+from cpcbl_team.frames import frame_text
 from cpcbl_transport.messages import Status
 
 REFUSALS = "refused"
@@ -46,6 +48,7 @@ class RobotStatus(msgspec.Struct, frozen=True, kw_only=True):
     position_sigma_m: float | None
     heading_sigma_deg: float | None
     tier: int | None
+    frame: str | None  # of its pose; None: no status came
     lost: str
     unconfirmed: str  # what nothing confirms about its pose, and why; empty if nothing is missing
     problems: tuple[str, ...]
@@ -83,6 +86,7 @@ def _robot_status(name: str, heard: TeamHeard, is_real: bool) -> RobotStatus:
         position_sigma_m=status.position_sigma_m if status else None,
         heading_sigma_deg=math.degrees(status.heading_sigma_rad) if status else None,
         tier=status.tier if status else None,
+        frame=frame_text(status.frame) if status else None,
         lost=status.lost if status else "",
         unconfirmed=status.unconfirmed if status else "",
         problems=tuple(one_line(t) for t in state.reasons if t != state.unconfirmed),
@@ -149,6 +153,9 @@ def team_view(robots: Collection[RobotStatus]) -> RenderableType:
         lines += [Text(f"{robot.robot}: {problem}", "red") for problem in robot.problems]
         if robot.unconfirmed:
             lines.append(Text(f"{robot.robot}: {robot.unconfirmed}", "yellow"))
+    frames = {robot.robot: robot.frame for robot in robots if robot.frame is not None}
+    if text := frames_text(frames):
+        lines.insert(0, Text(text))
     return Group(shown, *lines)
 
 
@@ -170,7 +177,7 @@ def _robot_lines(robot: RobotStatus) -> Iterator[RenderableType]:
         yield Text(f"  {robot.unconfirmed}", "yellow")
     if robot.tier is not None:
         sigma = f"{number(robot.position_sigma_m)} m, {number(robot.heading_sigma_deg, 1)} deg"
-        yield Text(f"  σ {sigma}, tier {robot.tier}")
+        yield Text(f"  σ {sigma}, tier {robot.tier}, in frame {robot.frame}")
     inputs = table("inputs", ("input",), ("/s", "delay s", REFUSALS))
     for own in robot.inputs:
         refused = _words(own.refused) or "0"

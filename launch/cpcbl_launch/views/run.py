@@ -18,6 +18,7 @@ from cpcbl_agents.robot_state import (
     misplaced_objects,
     robot_state,
 )
+from cpcbl_launch.reporting.frames import frames_text
 from cpcbl_launch.reporting.metrics import ErrorFigures
 from cpcbl_launch.reporting.phases import AWAY_S
 from cpcbl_launch.reporting.recorder import Effect, GuestReport, Recorder, Report, RobotReport
@@ -85,6 +86,9 @@ class LiveTable(LiveView):
             if state.word != "waiting" and (state.word != "gone" or name in self._robots)
             for reason in state.reasons
         ]
+        frames = {name: tracks[name].frame for name in states if name in tracks}
+        if text := frames_text(frames):
+            lines.insert(0, Text(text))
         return Group(self._table(recorder, processes, elapsed_s, states), *lines)
 
     def _silent_s(self, name: str, track: Track) -> float:
@@ -250,6 +254,8 @@ def _figures(s: ErrorFigures) -> list[str]:
 
 
 def _remarks(report: Report, is_wide: bool) -> Iterator[str]:
+    if text := frames_text({name: r.frame for name, r in report.robots.items() if r.has_data}):
+        yield f"At the end: {text}."
     if report.alone and is_wide:
         yield "Column before is the RMSE before teammates began to help, the others since then."
     if is_wide:

@@ -105,6 +105,29 @@ def test_a_robot_that_was_restarted_and_one_that_starts_late(tmp_path: Path) -> 
     assert result.processes[0].messages > 20
 
 
+def test_a_team_that_agrees_on_a_frame(tmp_path: Path) -> None:
+    """From its start, and from a state in the midst of it: candidates are part of it."""
+    record_run(tmp_path, load_team(builtin_path("unmapped")), 1, 6.0)
+    run, begun, candidates = read_run(tmp_path), set[str](), 0
+    assert replay_run(run).is_equal
+    for process in run.processes_of(()):
+        for until_s in (0.6, 1.7, 3.0):
+            part, whole = Replay(process, until_s=until_s), Replay(process)
+            part.run()
+            rest = Replay(process, state=part.state)
+            assert part.node is not None
+            frames = part.node.robot.filter._frames
+            assert frames is not None
+            candidates += len(frames.candidates)
+            begun.add(frames.frame)
+            rest.run()
+            whole.run()
+            assert part.difference is rest.difference is whole.difference is None
+            assert part.result.messages + rest.result.messages == whole.result.messages
+    assert len(begun) == 3
+    assert candidates >= 2
+
+
 def test_a_team_that_replays_logs_needs_them_no_more(tmp_path: Path) -> None:
     log, folder = write_log(tmp_path / "log", seconds=3.0), tmp_path / "run"
     logged = load_logged_team(load_team(builtin_path("mrclam")), log.folder)

@@ -115,6 +115,41 @@ def test_kills_one_of_four_robot_processes_and_it_localizes_again(
     assert not [pid for pid in seen.values() if command_of(pid)]
 
 
+def test_robots_that_know_neither_map_nor_start_agree_on_a_frame(tmp_path: Path) -> None:
+    """Also the best one, when it is started again: the others still are in its first frame."""
+    frames: dict[str, str] = {}
+    incarnation = ""
+
+    def in_one_frame(recorder: Recorder) -> bool:
+        tracks, statuses, _ = recorder.latest()
+        frames.update({name: track.frame for name, track in tracks.items()})
+        told = {status.frame for status in statuses.values()}
+        return len(tracks) == len(statuses) == 3 and told == set(frames.values()) == {first()}
+
+    def first() -> str:
+        return next((f for f in frames.values() if f.startswith("pioneer.")), "none")
+
+    def all_in_one_then_one_is_killed(recorder: Recorder, supervisor: Processes) -> bool:
+        nonlocal incarnation
+        errors_m = recorder.latest_errors_m()
+        if not in_one_frame(recorder) or len(errors_m) < 3 or max(errors_m.values()) > 0.5:
+            return False
+        incarnation = recorder.latest()[1]["pioneer"].incarnation
+        os.kill(supervisor.pids["robot-pioneer"], signal.SIGKILL)
+        return True
+
+    def it_is_back_in_the_frame_of_the_others(recorder: Recorder, supervisor: Processes) -> bool:
+        is_new = recorder.latest()[1]["pioneer"].incarnation != incarnation
+        return is_new and in_one_frame(recorder)
+
+    script = Script(all_in_one_then_one_is_killed, it_is_back_in_the_frame_of_the_others)
+    report = run(script, load_team(builtin_path("unmapped")), tmp_path)
+    assert {robot.frame for robot in report.robots.values()} == {first()}
+    assert report.robots["pioneer"].counts["frame_joined"] == 1
+    assert report.team.inside_3_sigma is not None
+    assert report.team.inside_3_sigma > 0.9
+
+
 def test_a_process_that_keeps_dying_is_restarted_ever_later(tmp_path: Path) -> None:
     fails = ProcessSpec("fails", (sys.executable, "-c", "raise SystemExit(3)"))
     with Supervisor([fails], tmp_path) as supervisor:

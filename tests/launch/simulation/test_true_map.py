@@ -70,7 +70,9 @@ def test_what_a_robot_finds_is_said_and_drawn(tmp_path: Path) -> None:
         off = np.array([found.x_m - true[0], found.y_m - true[1]])
         covariance = matrix2(Covariance2(*found.covariance))
         assert off @ np.linalg.solve(covariance, off) < 18.4
-    latest = LatestMessages(arrivals=seen(status), tokens=frozenset("t"), latest_s=10.0)
+    latest = LatestMessages(
+        arrivals=seen(status), places=status.places, tokens=frozenset("t"), latest_s=10.0
+    )
     picture = robot_pictures(Snapshot({"r": latest}), ["r"], 10.1, 0.0)["r"]
     first = status.places[0]
     assert picture.places[0][0] == first.landmark

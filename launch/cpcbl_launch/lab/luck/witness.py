@@ -19,6 +19,7 @@ from cpcbl_agents.node import Node
 from cpcbl_agents.robot import Robot
 from cpcbl_launch.lab.luck.network import HELP, Network
 from cpcbl_team.config import Team
+from cpcbl_team.frames import FIELD
 from cpcbl_team.inputs import Belief, Fix, HeadingBelief, Input, LandmarkBelief, Odometry
 from cpcbl_team.state import FIX, State
 from cpcbl_team.teammates import MOST_SENDERS
@@ -228,10 +229,12 @@ class _WatchedRobot(Robot):
         vars(self).update(vars(robot))
         self.filter, self._witness = _WatchedFilter(robot.filter, witness), witness
 
-    def handle(self, message: Message | Tick | BusEvent, now_ns: int) -> list[Outgoing]:
+    def handle(
+        self, message: Message | Tick | BusEvent, now_ns: int, frame: str = FIELD
+    ) -> list[Outgoing]:
         if type(message) in MESSAGES:
             self._witness.note_handled(message)  # type: ignore[arg-type]
-        return super().handle(message, now_ns)
+        return super().handle(message, now_ns, frame)
 
 
 class _WatchedFilter(FilterAgent):

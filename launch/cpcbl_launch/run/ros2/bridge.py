@@ -5,6 +5,7 @@ import time
 from collections.abc import Callable, Collection
 from functools import partial
 
+from cpcbl_launch.reporting.frames import main_frame
 from cpcbl_launch.run.ros2.diagnostics_out import (
     bridge_diagnostic,
     diagnostics_message,
@@ -15,7 +16,7 @@ from cpcbl_launch.run.ros2.refused import RefusalLog
 from cpcbl_launch.run.ros2.robot_inputs import InputTopic, RobotInputs, has_tags
 from cpcbl_launch.run.ros2.robot_outputs import Output, RobotOutputs
 from cpcbl_launch.run.ros2.stamps import SimulatedStamps, StampMap, UnixStamps
-from cpcbl_team.config import Team
+from cpcbl_team.config import Field, Team
 from cpcbl_transport.bus import Bus
 from cpcbl_transport.decoding import Received, Subscriber
 from cpcbl_transport.messages import Pose, Status
@@ -193,8 +194,10 @@ class TeamBridge:
             if now_s - at_s < HELP_S
         ]
         lasting_s = MARKERS_LAST / self._ros2.markers_rate_hz
-        frame = self._ros2.field_frame
-        return markers_message(poses, helps, self._team.map, frame, lasting_s)
+        shown = main_frame({name: pose.frame for name, pose in poses.items()})
+        poses = {name: pose for name, pose in poses.items() if pose.frame == shown}
+        field, frame = (Field(), shown) if shown else (self._team.map, self._ros2.field_frame)
+        return markers_message(poses, helps, field, frame, lasting_s)
 
 
 def _without_numbers(line: str) -> str:

@@ -80,7 +80,7 @@ class RobotOutputs:
         if at is None and self._ros2.sim_time:
             return  # its time in the simulation is not known
         ros_ns = pose.stamp_ns - self._delay_ns if at is None else at.ros_ns
-        field_frame = self._map_frame
+        field_frame = pose.frame or self._map_frame
         self._pose(pose_message(pose, ros_ns, field_frame))
         if self._keys.pose_odometry:
             base_frame = frames[1] or "base_link"

@@ -138,8 +138,11 @@ def _found_places(run: RunSummary, robot: Drawn, x: Axis, y: Axis) -> Iterator[s
 
 
 def _found(run: RunSummary, robot: Drawn) -> tuple[LandmarkEstimate, ...]:
-    status = run.recorder.status.get(robot.path.name)
-    return () if status is None else status.places
+    status, recorder = run.recorder.status.get(robot.path.name), run.recorder
+    if status is None:
+        return ()
+    places, frame = recorder.origins.places_in_field(status.places, status.frame)
+    return places if frame == recorder.shown_frame else ()
 
 
 def _field_axes(run: RunSummary, robots: Sequence[Drawn]) -> tuple[Axis, Axis, float, float]:
@@ -151,6 +154,7 @@ def _field_axes(run: RunSummary, robots: Sequence[Drawn]) -> tuple[Axis, Axis, f
     moving = [np.empty((0, 2))]
     for robot in robots:
         known = robot.path.pose[~robot.path.is_lost, :2]
+        known = known[np.isfinite(known).all(axis=1)]
         moving += [known, robot.path.truth[:, 1:3]]
     every = np.concatenate(moving)
     corners = [np.percentile(every, share, axis=0) for share in (0.5, 99.5)] if len(every) else []
@@ -191,7 +195,7 @@ def _field_path(robot: Drawn, x: Axis, y: Axis) -> Iterator[str]:
 def _field_end(robot: Drawn, x: Axis, y: Axis, taken: list[tuple[float, float]]) -> Iterator[str]:
     """The robot where it was last, its ellipse and its name, beside the names before."""
     path = robot.path
-    if not len(path.times_s):
+    if not len(path.times_s) or not np.isfinite(path.pose[-1]).all():
         return
     (at_x, at_y, heading), covariance = path.pose[-1], path.covariance[-1]
     px, py = float(x.at(at_x)), float(y.at(at_y))

@@ -13,13 +13,22 @@ from contextlib import contextmanager
 from types import MappingProxyType
 from typing import NamedTuple
 
+from cpcbl_launch.reporting.frames import FrameOrigins
 from cpcbl_launch.views.traffic import Arrival, with_arrival
+from cpcbl_team.frames import FIELD
 from cpcbl_team.geometry import wrap_angle
 from cpcbl_team.inputs import Sightings
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus, Handle
 from cpcbl_transport.decoding import Received, Subscriber
-from cpcbl_transport.messages import AnnotatedFrame, Status, Track, Truth, Truths
+from cpcbl_transport.messages import (
+    AnnotatedFrame,
+    LandmarkEstimate,
+    Status,
+    Track,
+    Truth,
+    Truths,
+)
 
 MOST_UNNAMED = 100  # robots that the team file does not name; more are ignored
 TRUTHS = 150  # the last 3 s of the simulated field's, at 50 Hz
@@ -51,6 +60,9 @@ class LatestMessages(NamedTuple):
     latest_s: float = 0.0  # of any track or status
     pause_s: float = 0.0  # between the last ones of them
     error_m: float | None = None  # the distance to the truth at the stamp of a track
+    places: tuple[LandmarkEstimate, ...] = ()
+    places_frame: str = FIELD  # in which they are
+    """Of the latest status. These and the track are in the field's frame, where theirs is known."""
 
     @property
     def status(self) -> Status | None:
@@ -91,6 +103,7 @@ class Feed:
         self._robots = dict.fromkeys(robots, LatestMessages())
         self._history: dict[str, deque[TrailPoint]] = {}
         self._truths: deque[TruthAt] = deque(maxlen=TRUTHS)
+        self._origins = FrameOrigins()
         self._unscored: dict[str, deque[Track]] = {}  # tracks that came before their truth
         self._problem = "not connected yet"
         self._connected_s: float | None = None
@@ -138,6 +151,7 @@ class Feed:
             self._robots = dict.fromkeys(sorted(self.named), LatestMessages())
             for log in (self._history, self._truths, self._unscored, self._frames):
                 log.clear()
+            self._origins = FrameOrigins()
             self._connected_s = self.now_s()
 
     def watch(self, more: int) -> None:
@@ -201,6 +215,10 @@ class Feed:
         with self._lock:
             if (latest := self._latest_of(track.robot)) is None:
                 return
+            self._origins.note_track(track)
+            track = self._origins.in_field(track)
+            if latest.track is not None and latest.track.frame != track.frame:
+                self._history.pop(track.robot, None)  # of another frame
             self._unscored.setdefault(track.robot, deque(maxlen=UNSCORED)).append(track)
             error_m = self._score(track.robot, latest.error_m)
             self._robots[track.robot] = with_arrival_time(latest, now_s)._replace(
@@ -220,8 +238,9 @@ class Feed:
         with self._lock:
             if (latest := self._latest_of(status.robot)) is not None:
                 arrivals = with_arrival(latest.arrivals, now_s, status)
+                places, frame = self._origins.places_in_field(status.places, status.frame)
                 self._robots[status.robot] = with_arrival_time(latest, now_s)._replace(
-                    arrivals=arrivals
+                    arrivals=arrivals, places=places, places_frame=frame
                 )
 
     def _on_sightings(self, received: Received[Sightings]) -> None:
@@ -246,6 +265,7 @@ class Feed:
         stamp_ns = received.message.stamp_ns
         truths = TruthAt(stamp_ns, {truth.robot: truth for truth in received.message.robots})
         with self._lock:
+            self._origins.note_truths(received.message)
             if self._truths and stamp_ns <= self._truths[-1].stamp_ns:
                 self._truths.clear()  # of another field
             self._truths.append(truths)
@@ -262,7 +282,9 @@ class Feed:
             until_ns = self._truths[-1].stamp_ns
         while tracks and tracks[0].stamp_ns <= until_ns:
             track = tracks.popleft()
-            if (known := pose_at(self._truths, robot, track.stamp_ns)) is not None:
+            if track.frame:  # nobody knows where that is
+                error_m = None
+            elif (known := pose_at(self._truths, robot, track.stamp_ns)) is not None:
                 error_m = _distance_m(known, track)
         return error_m
 

@@ -7,11 +7,13 @@ from typing import Any
 import msgspec
 
 from cpcbl_agents.robot_state import RobotState, Severity, Word, robot_state
+from cpcbl_launch.reporting.frames import main_frame
 from cpcbl_launch.reporting.metrics import degrees, ellipse_of
 from cpcbl_launch.reporting.statuses import SpendingReport, TrustReport
 from cpcbl_launch.views.traffic import LiveFlow, Traffic
 from cpcbl_launch.views.web.feed import LatestMessages, Snapshot, position_sigma_m
 from cpcbl_team.config import Field, Team
+from cpcbl_team.frames import FIELD, frame_text
 from cpcbl_team.inputs import Sighting, SightingFault
 from cpcbl_transport.messages import LandmarkEstimate, Refusal, Truth
 
@@ -29,7 +31,7 @@ Arrow = tuple[str, str, str, int, float | None]
 
 
 class RobotPicture(msgspec.Struct, frozen=True, omit_defaults=True):
-    """One robot as it is drawn. Metres and radians in the frame of the field; times are seconds
+    """One robot as it is drawn. Metres and radians in the frame that is shown; times are seconds
     since the start of the view."""
 
     state: Word
@@ -45,6 +47,7 @@ class RobotPicture(msgspec.Struct, frozen=True, omit_defaults=True):
     truth: Triple | None = None
     sees: tuple[tuple[str, float | None, float | None], ...] = ()  # what, range, bearing
     places: tuple[LandmarkPicture, ...] = ()  # of the landmarks that it finds itself
+    frame: str = ""  # in which its pose is; empty for that of the field
 
 
 class Frame(msgspec.Struct, frozen=True, tag="frame"):
@@ -134,6 +137,7 @@ def robot_pictures(
     own = {} if team is None else team.robots
     unused = {name for name, robot in own.items() if not robot.sensor.sees_landmarks}
     marks = frozenset[str]() if team is None else team.map.names
+    shown = shown_frame(now)
     return {
         name: picture
         for name, latest in now.robots.items()
@@ -145,9 +149,16 @@ def robot_pictures(
                 bool(named) and name not in named,
                 now_s,
                 began_s,
+                shown,
             )
         )
     }
+
+
+def shown_frame(now: Snapshot) -> str:
+    """The frame that is drawn: the field's, or else that in which most robots are."""
+    tracks = {name: latest.track for name, latest in now.robots.items()}
+    return main_frame({name: track.frame for name, track in tracks.items() if track is not None})
 
 
 def _used(latest: LatestMessages, unused: Collection[str]) -> tuple[Sighting, ...]:
@@ -163,8 +174,10 @@ def _picture(
     is_guest: bool,
     now_s: float,
     began_s: float,
+    shown: str,
 ) -> RobotPicture | None:
-    """None for a guest that left."""
+    """None for a guest that left. What is in another frame than the one that is `shown` has no
+    place in it."""
     found = state_of(latest, now_s)
     state = found.word
     since_s = now_s - max(latest.latest_s, latest.token_lost_s or 0.0)
@@ -173,7 +186,9 @@ def _picture(
     status, track = latest.status, latest.track
     is_fresh = state != "gone" and now_s - latest.sightings_s <= SEEN_S
     seen = tuple((s.id, _round(s.range_m), _round(s.bearing_rad)) for s in _used(latest, unused))
-    there = None if truth is None else (truth.x_m, truth.y_m, truth.heading_rad)
+    is_known = truth is not None and shown == FIELD
+    there = (truth.x_m, truth.y_m, truth.heading_rad) if truth is not None and is_known else None
+    places = latest.places if latest.places_frame == shown and state != "gone" else ()
     common = RobotPicture(
         state=state,
         severity=found.severity,
@@ -183,10 +198,13 @@ def _picture(
         tier=None if status is None else status.tier,
         truth=None if there is None else _triple(*there),
         sees=seen if is_fresh else (),
-        places=() if status is None or state == "gone" else tuple(map(_place, status.places)),
+        places=tuple(map(_place, places)),
+        frame="" if status is None else status.frame,
     )
     if track is None:
         return common
+    if track.frame != shown:
+        return msgspec.structs.replace(common, at_s=_round(latest.track_s - began_s))
     ellipse = None if track.covariance is None else ellipse_of(*track.covariance[:3])
     return msgspec.structs.replace(
         common,
@@ -221,6 +239,14 @@ def notice_text(now: Snapshot, team: str, where: str, now_s: float) -> str:
         return (
             f"No robot of team `{team}` is heard at {where}. Compare the team's name with that in"
             " the robots' team file, and their --connect with this address."
+        )
+    shown = shown_frame(now)
+    tracks = {name: latest.track for name, latest in now.robots.items()}
+    elsewhere = sorted(n for n, track in tracks.items() if track and track.frame != shown)
+    if elsewhere:
+        return (
+            f"Drawn is frame {frame_text(shown)}. Not drawn, for nobody knows yet where their"
+            f" frames are: {', '.join(elsewhere)}."
         )
     return ""
 

@@ -77,7 +77,7 @@ function robot(name) {
 }
 
 // What the server leaves out has its default.
-const DEFAULTS = { severity: "good", why: "", is_guest: false, at_s: null, pose: null, ellipse: null, sigma_m: null, error_m: null, tier: null, truth: null, sees: [], places: [] };
+const DEFAULTS = { severity: "good", why: "", is_guest: false, at_s: null, pose: null, ellipse: null, sigma_m: null, error_m: null, tier: null, truth: null, sees: [], places: [], frame: "" };
 
 function frame(message) {
   say({ ack: message.number });

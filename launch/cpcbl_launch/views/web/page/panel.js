@@ -37,8 +37,9 @@ export class Panel {
     set(button, r.is_guest ? `${r.name} (guest)` : r.name);
     set(cells[0], state);
     cells[0].className = `s-${state}`;
-    reason.hidden = state === "ok" || !r.why;
-    set(reason.firstChild, r.why ?? "");
+    const words = [state === "ok" ? "" : r.why, r.frame && `in frame ${r.frame}`].filter(Boolean).join("; ");
+    reason.hidden = !words;
+    set(reason.firstChild, words);
     reason.firstChild.className = `s-${state}`;
     const isThere = state !== "gone" && state !== "waiting";
     [isThere ? r.tier ?? "–" : "–", isThere ? number(r.sigma_m) : "–", isThere ? number(r.error_m) : "–", isThere ? r.sees.length : "–"].forEach((v, i) => set(cells[i + 1], String(v)));
