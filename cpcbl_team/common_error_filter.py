@@ -19,8 +19,10 @@ from cpcbl_team.fusion import Observation
 from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.geometry import wrap_angle
 from cpcbl_team.inputs import LandmarkBelief, Sighting
+from cpcbl_team.landmark_readings import LandmarkReading, with_reading
 from cpcbl_team.measurements import GatedObject, Measurement, observation_of
-from cpcbl_team.new_landmarks import LandmarkReading, relative_place, with_reading
+from cpcbl_team.miscalibration import noise_with_factor
+from cpcbl_team.new_landmarks import relative_place
 from cpcbl_team.parameters import Sensitivity, sensitivity_dot
 from cpcbl_team.places import EXACT, place_covariance
 from cpcbl_team.sensors import sighting_sigmas
@@ -63,7 +65,7 @@ class CommonErrorFilter:
     def __init__(
         self, settings: LocalizationSettings, field: Field, camera: CameraSettings | None
     ) -> None:
-        self._field, self._sensor = field, settings.sensor
+        self._field, self._sensor, self._noise = field, settings.sensor, settings.odometry
         self._learns_camera = camera is not None and camera.self_calibration
         self._splits = settings.collaboration.fusion == "split-ci"
         self.prior = CommonErrors.of_camera(0.0, EXACT)
@@ -130,7 +132,8 @@ class CommonErrorFilter:
         readings = with_reading(before, reading)
         if readings is before:
             return state
-        found = relative_place(readings, place)
+        noise = noise_with_factor(self._noise, memory.adaptation.motion_factor)
+        found = relative_place(readings, place, noise)
         unplaced = {n: r for n, r in memory.unplaced.items() if n != name}
         if found is None:
             memory = memory._replace(unplaced={**unplaced, name: readings})

@@ -16,6 +16,7 @@ from cpcbl_team.config import Field, Start
 from cpcbl_team.estimate import HEADING, POSE, POSITION, Covariance3, Estimate, Scope
 from cpcbl_team.geometry import Pose2, new, wrap_angle
 from cpcbl_team.inputs import Belief, LandmarkBelief, Odometry, Sighting
+from cpcbl_team.landmark_readings import LandmarkReading
 from cpcbl_team.map_rejections import MapRejections
 from cpcbl_team.map_residuals import MapResiduals
 from cpcbl_team.miscalibration import (
@@ -24,7 +25,6 @@ from cpcbl_team.miscalibration import (
     ModelCheck,
     with_doubts,
 )
-from cpcbl_team.new_landmarks import LandmarkReading
 from cpcbl_team.range_errors import RangeEvidence
 from cpcbl_team.self_calibration import ReferencePoses, SelfCalibration
 from cpcbl_team.sender_records import SenderRecord

@@ -20,15 +20,14 @@ from support.core import (
 from cpcbl_team.config import Field, Gives, LocalizerSettings, SensorSettings, Start, Unsurveyed
 from cpcbl_team.geometry import Pose2, wrap_angle
 from cpcbl_team.inputs import InitialPose, Sighting, Sightings
-from cpcbl_team.localizer import Localizer
-from cpcbl_team.new_landmarks import (
-    LEAST_READINGS,
+from cpcbl_team.landmark_readings import (
     MOST_READINGS,
     SPACING_NS,
     LandmarkReading,
-    relative_place,
     with_reading,
 )
+from cpcbl_team.localizer import Localizer
+from cpcbl_team.new_landmarks import LEAST_READINGS, relative_place
 from cpcbl_team.state import State
 
 BOX = (3.0, 1.0)

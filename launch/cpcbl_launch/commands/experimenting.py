@@ -154,6 +154,14 @@ def worlds(
     conduct(experiment.EXPERIMENT._replace(cases=cases), seeds, where, output, as_json)
 
 
+_add_command(
+    "mapping",
+    "mapping:EXPERIMENT",
+    50,
+    "Teams that find all landmarks while they drive, beside the same teams on the surveyed map.",
+)
+
+
 @experiment_app.command("luck")
 def luck(
     seeds: Annotated[int, Option(min=1, help="Histories, each of its own seed.")] = 20,
