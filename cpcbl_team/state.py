@@ -25,6 +25,7 @@ from cpcbl_team.miscalibration import (
     ModelCheck,
     with_doubts,
 )
+from cpcbl_team.moved_landmarks import Innovations, Moves
 from cpcbl_team.range_errors import RangeEvidence
 from cpcbl_team.self_calibration import ReferencePoses, SelfCalibration
 from cpcbl_team.sender_records import SenderRecord
@@ -182,6 +183,10 @@ class CalibrationMemory(NamedTuple):
     residuals: MapResiduals = MapResiduals()
     unplaced: Mapping[str, tuple[LandmarkReading, ...]] = _NONE
     """What was read of landmarks whose places are not known yet."""
+    innovations: Innovations = _NONE
+    """Of landmarks whose places the robot has found itself,"""
+    moved: Moves = _NONE
+    """and those of them that moved since then."""
     stationary: StationaryRecord | None = None  # None while it drives
 
     @property
@@ -196,7 +201,7 @@ class CalibrationMemory(NamedTuple):
 
     def misplaced(self, stamp_ns: int) -> str:
         """The object that must stand elsewhere than on the map; empty if there is none."""
-        return self.rejections.misplaced(stamp_ns) or self.residuals.misplaced()
+        return self.rejections.misplaced(stamp_ns) or self.residuals.misplaced
 
     @property
     def bearing_bias_rad(self) -> float:

@@ -36,6 +36,7 @@ from cpcbl_launch.reporting.statuses import (
     trust_reports,
 )
 from cpcbl_team.config import Team
+from cpcbl_team.misplacements import MISPLACED, MOVES, REJECTED
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus
 from cpcbl_transport.decoding import decode
@@ -308,7 +309,7 @@ class Recorder:
         for status in statuses:
             counts.update(status.counts)
         latest = statuses[-1].counts if statuses else {}
-        percentages = {name: n for name, n in latest.items() if name.endswith("_percent")}
+        percentages = {name: n for name, n in latest.items() if _is_figure(name)}
         return RobotReport(
             **msgspec.structs.asdict(figures),
             variant=variant,
@@ -346,6 +347,11 @@ def truth_rows(truths: Iterable[Truths]) -> dict[str, Floats]:
         for t in at.robots:
             rows.setdefault(t.robot, []).append((at.stamp_ns * 1e-9, t.x_m, t.y_m, t.heading_rad))
     return {name: np.array(r) for name, r in rows.items()}
+
+
+def _is_figure(count: str) -> bool:
+    """Whether a count of a status is no number of events, so that those of processes are no sum."""
+    return count.endswith("_percent") or count.startswith((MISPLACED, MOVES, REJECTED))
 
 
 def _longest_lost_s(tracks: list[Track]) -> float:

@@ -14,7 +14,6 @@ from rich.console import RenderableType
 
 from cpcbl_launch.lab.experiments.runs import Experiment, Outcome, Results, new_outcome
 from cpcbl_launch.lab.experiments.world_list import (
-    KINDS,
     LEARNING_S,
     World,
     circuit_world,
@@ -29,7 +28,7 @@ from cpcbl_launch.lab.experiments.worlds import (
 )
 from cpcbl_launch.reporting.tables import cells, table
 from cpcbl_launch.simulation.true_map import true_map
-from cpcbl_team.config import Field
+from cpcbl_team.config import Field, Gives
 from cpcbl_team.gaussian import Covariance2
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus
@@ -37,6 +36,7 @@ from cpcbl_transport.decoding import decode
 from cpcbl_transport.messages import LandmarkEstimate, Status
 
 LANDMARKS = 8
+GIVES: tuple[Gives, ...] = ("both", "range", "bearing")
 TEAMS = ("a", "a"), ("ac", "ac"), ("ac", "a"), ("abcde", "abcde"), ("abcde", "ac")
 """The robots, and those of them that see landmarks."""
 
@@ -91,9 +91,9 @@ class PlaceWatch:
 
 def cases() -> dict[tuple[str, str, str], MappingCase]:
     """Each team with each kind of readings, by robots, those that see landmarks, and readings."""
-    found = {}
+    found: dict[tuple[str, str, str], MappingCase] = {}
     for robots, seeing in TEAMS:
-        for gives, _ in KINDS:
+        for gives in GIVES:
             world = circuit_world(seeing, robots=robots, places=LANDMARKS, gives=gives)
             world = world._replace(duration_s=LEARNING_S)
             unsurveyed = world._replace(team=with_unsurveyed(world.team, 0))
@@ -170,9 +170,9 @@ def tables(result: Outcome) -> Iterable[RenderableType]:
             f"[{COLOURS[word]}]{word}",
         )
     yield shown
-    yield "see: robots that see landmarks; the others see teammates alone. surveyed: the RMSE of the"
-    yield "same team on the surveyed map. places: the NEES of the places that robots state (2 is due)."
-    yield "B: what a robot sent about places in the whole run. Else as in `experiment worlds`."
+    yield "see: robots that see landmarks; the others see teammates alone. surveyed: the RMSE of"
+    yield "the same team on the surveyed map. places: the NEES of the places that robots state (2 is"
+    yield "due). B: what a robot sent about places in the run. Else as in `experiment worlds`."
 
 
 EXPERIMENT = Experiment("mapping", cases, outcome, tables, run_mapping, drawn=False)
