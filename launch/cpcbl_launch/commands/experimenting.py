@@ -162,6 +162,14 @@ _add_command(
 )
 
 
+_add_command(
+    "wrong-maps",
+    "wrong_maps:EXPERIMENT",
+    20,
+    "Landmarks that are pushed, or of one name; maps that are mirrored or in other units.",
+)
+
+
 @experiment_app.command("luck")
 def luck(
     seeds: Annotated[int, Option(min=1, help="Histories, each of its own seed.")] = 20,

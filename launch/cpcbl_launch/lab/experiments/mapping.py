@@ -171,8 +171,8 @@ def tables(result: Outcome) -> Iterable[RenderableType]:
         )
     yield shown
     yield "see: robots that see landmarks; the others see teammates alone. surveyed: the RMSE of"
-    yield "the same team on the surveyed map. places: the NEES of the places that robots state (2 is"
-    yield "due). B: what a robot sent about places in the run. Else as in `experiment worlds`."
+    yield "the same team on the surveyed map. places: the NEES of the places that robots state (2"
+    yield "is due). B: what a robot sent about places in the run. Else as in `experiment worlds`."
 
 
 EXPERIMENT = Experiment("mapping", cases, outcome, tables, run_mapping, drawn=False)
