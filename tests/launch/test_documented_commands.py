@@ -29,11 +29,10 @@ PATIENCE_S = 60.0
 WATCHED = LIVE._replace(says="watched for", beside="team.toml")
 BUDGET = Way(EXPERIMENT, "long", "--team-size 2 --seeds 1")
 SHORT, UNCERTAIN = "--duration 12", "worlds --worlds uncertain,unsurveyed"
-LEDGER = "run, 60 s", "what each was worth"
+LEDGER, GUEST = ("run, 60 s", "what each was worth"), "before, during and after guest"
 LIAR, TABLE_1 = ("one liar, 2 honest",), ("errors at waypoints",)
 OVAL = ("navigator, 5 loops, 20 runs",)
 FIGURE_7 = "navigator, 5 loops, 50 runs", "navigator with a camera, 5 loops"
-GUEST = "before, during and after guest"
 TRIPOD = "tripod took part", f"{GUEST} tripod"
 SIMULATED = "errors of position and heading"
 CALIBRATED = "way, true = scale x reported"
