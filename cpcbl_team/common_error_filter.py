@@ -19,15 +19,40 @@ from cpcbl_team.fusion import Observation
 from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.geometry import wrap_angle
 from cpcbl_team.inputs import LandmarkBelief, Sighting
+from cpcbl_team.landmark_readings import LandmarkReading, with_reading
+from cpcbl_team.map_rejections import MapRejections
 from cpcbl_team.measurements import GatedObject, Measurement, observation_of
-from cpcbl_team.new_landmarks import LandmarkReading, relative_place, with_reading
+from cpcbl_team.miscalibration import noise_with_factor
+from cpcbl_team.moved_landmarks import (
+    biased_landmark,
+    inflated,
+    with_found_anew,
+    with_innovations,
+    with_move,
+)
+from cpcbl_team.new_landmarks import relative_place
 from cpcbl_team.parameters import Sensitivity, sensitivity_dot
 from cpcbl_team.places import EXACT, place_covariance
 from cpcbl_team.sensors import sighting_sigmas
-from cpcbl_team.state import State, with_calibration, with_common_errors, with_uses
+from cpcbl_team.state import (
+    State,
+    Updates,
+    with_calibration,
+    with_common_errors,
+    with_teammates,
+    with_uses,
+)
 
+LATEST, LEAST_ACCEPTED = 8, 3
 _ZERO_ROW: Row = (0.0, 0.0, 0.0)
 _UNAFFECTED: tuple[Sensitivity, Sensitivity] = ((), ())
+
+
+def accepts_others(updates: Updates) -> bool:
+    """Whether enough of the latest innovations were accepted: what is rejected then is wrong, not
+    the robot."""
+    latest = updates.innovations & (1 << LATEST) - 1
+    return latest.bit_count() >= LEAST_ACCEPTED
 
 
 def considers_common_errors(settings: LocalizationSettings) -> bool:
@@ -63,7 +88,7 @@ class CommonErrorFilter:
     def __init__(
         self, settings: LocalizationSettings, field: Field, camera: CameraSettings | None
     ) -> None:
-        self._field, self._sensor = field, settings.sensor
+        self._field, self._sensor, self._noise = field, settings.sensor, settings.odometry
         self._learns_camera = camera is not None and camera.self_calibration
         self._splits = settings.collaboration.fusion == "split-ci"
         self.prior = CommonErrors.of_camera(0.0, EXACT)
@@ -113,8 +138,9 @@ class CommonErrorFilter:
         """The state after a sighting of a landmark whose place is not known yet: with its place, if
         that is determined now."""
         common, name = state.common_errors, sighting.id
+        memory = state.memory.calibration
         assert common is not None
-        if state.lost:
+        if state.lost or (name in memory.moved and memory.moved[name].is_unreliable):
             return state
         mark = self._field.unsurveyed[name]
         range_m = sighting.range_m if mark.gives in ("both", "range") else None
@@ -125,12 +151,12 @@ class CommonErrorFilter:
             return state
         place, read = state.odometry_from_robot, (range_m, bearing)
         reading = LandmarkReading(now_ns, place, *read, *sighting_sigmas(sighting, self._sensor))
-        memory = state.memory.calibration
         before = memory.unplaced.get(name, ())
         readings = with_reading(before, reading)
         if readings is before:
             return state
-        found = relative_place(readings, place)
+        noise = noise_with_factor(self._noise, memory.adaptation.motion_factor)
+        found = relative_place(readings, place, noise)
         unplaced = {n: r for n, r in memory.unplaced.items() if n != name}
         if found is None:
             memory = memory._replace(unplaced={**unplaced, name: readings})
@@ -141,7 +167,8 @@ class CommonErrorFilter:
             updates = state.updates  # what comes next may err as these readings did
             used = with_uses(updates.objects_ns, {name: state.stamp_ns})
             state = state._replace(updates=updates._replace(objects_ns=used))
-            memory = memory._replace(unplaced=unplaced, common=common)
+            moved = with_found_anew(memory.moved, name, common, found, state.stamp_ns)
+            memory = memory._replace(unplaced=unplaced, common=common, moved=moved)
         return with_calibration(state, memory)
 
     def corrected(self, state: State, sighting: Sighting) -> Sighting:
@@ -197,7 +224,42 @@ class CommonErrorFilter:
                 self._splits,
                 m.is_for_heading,
             )
+        if common.found:
+            return self._watch_found(state, accepted, estimate, common)
         return with_common_errors(state, common), estimate
+
+    def _watch_found(
+        self,
+        state: State,
+        accepted: Sequence[GatedObject],
+        estimate: Estimate,
+        common: CommonErrors,
+    ) -> tuple[State, Estimate]:
+        """The state and the estimate after a correction; without the place of a landmark that the
+        robot has found and that no longer stands there. It is found anew."""
+        memory, now_ns = state.memory.calibration, state.stamp_ns
+        assert memory.common is not None
+        prior = state.estimate, memory.common
+        sums = with_innovations(memory.innovations, *prior, accepted, now_ns)
+        name = memory.rejections.misplaced(now_ns)
+        is_rejected = common.objects.get(name) in common.found and accepts_others(state.updates)
+        if not is_rejected:
+            name = biased_landmark(sums, now_ns)
+            if name:
+                estimate, common = inflated(estimate, common)
+        if not name or name not in common.objects:
+            memory = memory._replace(common=common, innovations=sums)
+            return with_calibration(state, memory), estimate
+        memory = memory._replace(
+            moved=with_move(memory.moved, name, common, now_ns),
+            common=common.without_object(name),
+            innovations={},
+            rejections=MapRejections(stamp_ns=now_ns, counted=state.updates.accepted),
+        )
+        mates = state.memory.teammates
+        beliefs = {n: belief for n, belief in mates.landmarks.items() if n != name}
+        state = with_teammates(state, mates._replace(landmarks=beliefs))
+        return with_calibration(state.counted("landmark_moved"), memory), estimate
 
     def landmark_belief_nis(
         self, state: State, belief: LandmarkBelief, covariance: Covariance2

@@ -120,6 +120,14 @@ class CommonErrors(NamedTuple):
         objects, found = {**self.objects, name: number}, (*self.found, number)
         return CommonErrors(self.axis_rad, (*self.values, x, y), parameters, objects, found)
 
+    def without_object(self, name: str) -> "CommonErrors":
+        """Without what is known of one object. Raises KeyError without such an object."""
+        gone = self.objects[name]
+        numbers = {n: i - 2 * (i > gone) for n, i in self.objects.items() if n != name}
+        found = tuple(i - 2 * (i > gone) for i in self.found if i != gone)
+        values = self.values[:gone] + self.values[gone + 2 :]
+        return CommonErrors(self.axis_rad, values, self.parameters.without(gone, 2), numbers, found)
+
     def without_objects(self) -> "CommonErrors":
         """With what is known of the camera alone."""
         covariance, with_pose = self.parameters

@@ -130,14 +130,14 @@ class Landmarks:
         state: State,
         sightings: tuple[Sighting, ...],
         scope: Scope | None,
-        cooling_down: frozenset[str],
+        unusable: frozenset[str],
         recorded: frozenset[str],
     ) -> LandmarkUpdate:
-        """What the landmarks among `sightings` say about position or heading, or about both. An
-        object that is `cooling_down` is not plain; one of `recorded` is no new evidence."""
+        """What the landmarks among `sightings` say about position or heading, or about both. One
+        of the `unusable` objects is not plain; one of `recorded` is no new evidence."""
         update, marks = LandmarkUpdate(state), self._marks
-        if cooling_down:
-            marks = {name: mark for name, mark in marks.items() if name not in cooling_down}
+        if unusable:
+            marks = {name: mark for name, mark in marks.items() if name not in unusable}
         uses_range = scope is not None and scope is not HEADING
         uses_bearing = scope is not None and (scope is not POSITION or self._uses_rays)
         for sighting in sightings:

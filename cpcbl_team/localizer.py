@@ -152,16 +152,14 @@ class Localizer:
         now, stamp_ns, updates = frame.stamp_ns, state.stamp_ns, state.updates
         recovery = state.memory.recovery
         recorded = recently_recorded(recovery, stamp_ns)
-        cooling_down = self._timers.cooling_down(updates, stamp_ns, now)
+        unusable = self._timers.unusable(state, now)
         for scope in self._update_order(state):
-            landmarks = self._landmarks.update(
-                state, frame.sightings, scope, cooling_down, recorded
-            )
+            landmarks = self._landmarks.update(state, frame.sightings, scope, unusable, recorded)
             measured: list[Measurement] = []
             faults: list[str] = []
             if landmarks.others:
                 state, measured, faults = self._measure_others(state, landmarks.others, now)
-            usable = self._timers.usable(updates, measured, now) if measured else measured
+            usable = measured and self._timers.usable(updates, measured, now, unusable)
             if landmarks.constrains or any(constrains(m, scope, self._rules) for m in usable):
                 break
         if landmarks.unrecorded:

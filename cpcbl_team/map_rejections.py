@@ -8,7 +8,6 @@ FADING_S: Final = 120.0  # of rejections of objects of the map
 LEAST_MISPLACED: Final = 6.0  # rejections of an object that stands elsewhere,
 MISPLACED_SHARE: Final = 0.7  # of all, and
 MISPLACED_REJECTED: Final = 0.003  # of what is accepted, of any object
-MISPLACED: Final = "misplaced_"  # the count of such an object begins with this
 _NONE: Final[Mapping[str, float]] = {}
 
 

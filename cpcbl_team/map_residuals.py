@@ -37,6 +37,12 @@ class Offset(NamedTuple):
         xx, xy, yy, x, y, _, _ = self
         return (yy * x * x - 2.0 * xy * x * y + xx * y * y) / (xx * yy - xy * xy)
 
+    @property
+    def distance_m(self) -> float:
+        """How far from its place the object stands by all readings."""
+        xx, xy, yy, x, y, _, _ = self
+        return math.hypot(yy * x - xy * y, xx * y - xy * x) / (xx * yy - xy * xy)
+
 
 NO_OFFSET: Final = Offset()
 _NONE: Final[Mapping[str, Offset]] = {}
@@ -46,20 +52,23 @@ class MapResiduals(NamedTuple):
     """The offsets of the objects of a map from their places."""
 
     of_object: Mapping[str, Offset] = _NONE
-
-    def misplaced(self) -> str:
-        """The object that must stand elsewhere than on the map; empty if there is none."""
-        if len(self.of_object) < 3:  # of two that contradict each other either one may be wrong
-            return ""
-        ranked = sorted((o.chi_square, name) for name, o in self.of_object.items())
-        (second, _), (most, name) = ranked[-2:]
-        others = [o for other, o in self.of_object.items() if other != name]
-        unit = sum(o.squares for o in others) / max(sum(o.readings for o in others), 1.0)
-        least = max(LEAST_CHI_SQUARE * max(unit, 1.0), LEAST_RATIO * second)
-        return name if most > least else ""
+    misplaced: str = ""
+    """The object that must stand elsewhere than on the map; empty if there is none."""
 
 
 NO_RESIDUALS: Final = MapResiduals()
+
+
+def misplaced_object(offsets: Mapping[str, Offset]) -> str:
+    """The object that must stand elsewhere than on the map; empty if there is none."""
+    if len(offsets) < 3:  # of two that contradict each other either one may be wrong
+        return ""
+    ranked = sorted((o.chi_square, name) for name, o in offsets.items())
+    (second, _), (most, name) = ranked[-2:]
+    others = [o for other, o in offsets.items() if other != name]
+    unit = sum(o.squares for o in others) / max(sum(o.readings for o in others), 1.0)
+    least = max(LEAST_CHI_SQUARE * max(unit, 1.0), LEAST_RATIO * second)
+    return name if most > least else ""
 
 
 class OffsetSums:
@@ -134,4 +143,5 @@ class ResidualSums:
             sums.add(u, v, residual, weight)
 
     def residuals(self) -> MapResiduals:
-        return MapResiduals({name: sums.offset() for name, sums in self._of_object.items()})
+        offsets = {name: sums.offset() for name, sums in self._of_object.items()}
+        return MapResiduals(offsets, misplaced_object(offsets))

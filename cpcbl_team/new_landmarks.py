@@ -3,65 +3,48 @@
 The readings of the last seconds are brought to the present by dead reckoning, which gives the place
 in the robot's frame by least squares. One reading of range and bearing is a place; bearings alone
 are one when they were taken from places far enough apart (parallax), and so are ranges alone.
+Places that may be right are looked for as if the errors of dead reckoning at each reading were
+independent. They are not: an error remains in all that was read before it. So the best place is
+estimated anew beside these errors (`drifting_landmarks.py`).
 """
 
 import math
 from collections.abc import Iterator, Sequence
-from typing import Final, NamedTuple
+from typing import Final
 
+from cpcbl_team.config import OdometryNoise
 from cpcbl_team.constraints import NEAREST_M, circle, heading
+from cpcbl_team.drifting_landmarks import place_beside_drift
 from cpcbl_team.estimate import circle_variance
 from cpcbl_team.fusion import chi_square_bound
-from cpcbl_team.gaussian import Covariance2, Gaussian2
+from cpcbl_team.gaussian import Gaussian2
 from cpcbl_team.geometry import Pose2
+from cpcbl_team.landmark_readings import LandmarkReading
 from cpcbl_team.motion import drift_sigmas
 
 LEAST_READINGS: Final = 3  # one alone may have a wrong name
-MOST_READINGS: Final = 12
-SPACING_NS: Final = 500_000_000  # between two that are kept
-WINDOW_NS: Final = 20_000_000_000
-LARGEST_SHARE: Final = 0.1  # sigma by distance: beyond, the place cannot be linearized
-RIVAL: Final = (
-    9.0  # another place whose chi-square is larger by less than this may be the right one
-)
+LARGEST_SHARE: Final = 0.2  # sigma by distance: beyond, the place cannot be linearized
+RIVAL: Final = 16.0
+"""Another place whose chi-square is larger by less than this may be the right one."""
+SAME_M: Final = 0.05
 APART_SIGMAS: Final = 3.0
 FARTHEST_M: Final = 1000.0
+EXACT_ODOMETRY: Final = OdometryNoise(
+    distance_sigma_m_per_sqrt_m=0.0, turn_sigma_rad_per_sqrt_rad=0.0, turn_sigma_rad_per_sqrt_m=0.0
+)
 _DISTANCES_M: Final = (1.0, 3.0, 10.0)  # along a bearing without a range: a place is looked for
 _DIRECTIONS: Final = 8  # around a range without a bearing
 _ITERATIONS: Final = 10
 
 
-class LandmarkReading(NamedTuple):
-    """One reading of a landmark that is not on the map."""
-
-    stamp_ns: int
-    odometry_from_robot: Pose2  # dead reckoning at that time
-    range_m: float | None
-    bearing_rad: float | None
-    range_sigma_m: float
-    bearing_sigma_rad: float
-
-
-def with_reading(
-    readings: tuple[LandmarkReading, ...], reading: LandmarkReading
-) -> tuple[LandmarkReading, ...]:
-    """The readings with one more, without what is too old; the same if it comes too soon. Of too
-    many the one goes that has the nearest neighbours in time, so that the others are far apart."""
-    if readings and reading.stamp_ns - readings[-1].stamp_ns < SPACING_NS:
-        return readings
-    kept = [r for r in readings if reading.stamp_ns - r.stamp_ns <= WINDOW_NS]
-    kept.append(reading)
-    if len(kept) > MOST_READINGS:
-        inner = range(1, len(kept) - 1)
-        del kept[min(inner, key=lambda i: kept[i + 1].stamp_ns - kept[i - 1].stamp_ns)]
-    return tuple(kept)
-
-
 def relative_place(
-    readings: Sequence[LandmarkReading], odometry_from_robot: Pose2
+    readings: Sequence[LandmarkReading],
+    odometry_from_robot: Pose2,
+    noise: OdometryNoise = EXACT_ODOMETRY,
 ) -> Gaussian2 | None:
     """The place that the readings determine, in the frame of the robot at this time; None where
-    they do not: too few, too little parallax, contradictory, or two places that fit."""
+    they do not: too few, too little parallax, contradictory, or two places that fit. `noise`: of
+    the odometry."""
     if len(readings) < LEAST_READINGS:
         return None
     now_from_odometry = odometry_from_robot.inverse()
@@ -70,18 +53,32 @@ def relative_place(
     found = sorted((fit for fit in fits if fit is not None), key=lambda fit: fit[1])
     if not found:
         return None
-    place, cost = found[0]
+    read = [(s.pose, s.reading) for s in seen]
+    place, nis = place_beside_drift(*found[0][0], read, noise)
+    if place is None:
+        return None
     x, y, covariance = place
     freedom = sum((r.range_m is not None) + (r.bearing_rad is not None) for r in readings) - 2
     spread = circle_variance(*covariance)
     nearest = min(math.hypot(x - s.pose.x, y - s.pose.y) for s in seen)
-    if spread > (LARGEST_SHARE * nearest) ** 2 or freedom < 1 or cost > chi_square_bound(freedom):
+    if spread > (LARGEST_SHARE * nearest) ** 2 or freedom < 1 or nis > chi_square_bound(freedom):
         return None
     apart_m = APART_SIGMAS * math.sqrt(spread)
-    for (other_x, other_y, _), other_cost in found[1:]:
-        if math.hypot(other_x - x, other_y - y) > apart_m and other_cost < cost + RIVAL:
+    for other in _distinct([fit for fit, _ in found])[1:]:
+        rival, other_nis = place_beside_drift(*other, read, noise)
+        is_same = rival is not None and math.hypot(rival.x - x, rival.y - y) <= apart_m
+        if not is_same and other_nis < nis + RIVAL:
             return None
     return place
+
+
+def _distinct(places: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
+    """The places, each once."""
+    kept: list[tuple[float, float]] = []
+    for x, y in places:
+        if all(math.hypot(x - a, y - b) > SAME_M for a, b in kept):
+            kept.append((x, y))
+    return kept
 
 
 class _Seen:
@@ -114,7 +111,7 @@ def _starts(seen: Sequence[_Seen]) -> Iterator[tuple[float, float]]:
             yield pose.transform(distance * math.cos(bearing), distance * math.sin(bearing))
 
 
-def _fit(x: float, y: float, seen: Sequence[_Seen]) -> tuple[Gaussian2, float] | None:
+def _fit(x: float, y: float, seen: Sequence[_Seen]) -> tuple[tuple[float, float], float] | None:
     """The place by least squares (Levenberg-Marquardt) from a start, and its chi-square."""
     damping, cost = 1e-3, _cost(x, y, seen)
     for _ in range(_ITERATIONS):
@@ -134,10 +131,7 @@ def _fit(x: float, y: float, seen: Sequence[_Seen]) -> tuple[Gaussian2, float] |
     if math.hypot(x, y) > FARTHEST_M:
         return None
     xx, xy, yy, _, _ = _normal_equations(x, y, seen)
-    information = Covariance2(xx, xy, yy)
-    if information.determinant() <= 1e-12 * xx * yy:
-        return None
-    return Gaussian2(x, y, information.inverse()), cost
+    return None if xx * yy - xy * xy <= 1e-12 * xx * yy else ((x, y), cost)
 
 
 def _normal_equations(

@@ -10,7 +10,7 @@ from typing import Final
 from cpcbl_team.config import LocalizationSettings
 from cpcbl_team.measurements import Measurement
 from cpcbl_team.sensors import repetition_variance_factor
-from cpcbl_team.state import Updates
+from cpcbl_team.state import State, Updates
 
 _NOBODY: Final[frozenset[str]] = frozenset()
 
@@ -32,19 +32,31 @@ class ObjectTimers:
         """Whether the object was used too short a time ago."""
         return not has_passed(updates.objects_ns.get(source), now_ns, self._interval_ns)
 
-    def cooling_down(self, updates: Updates, stamp_ns: int, now_ns: int) -> frozenset[str]:
-        """The objects of which a frame of the time `now_ns` may not be used at `stamp_ns`."""
-        if self._interval_ns == 0.0 and now_ns >= stamp_ns:
-            return _NOBODY
-        return frozenset(
+    def unusable(self, state: State, now_ns: int) -> frozenset[str]:
+        """The objects of which a frame of the time `now_ns` may not be used: those used too short a
+        time ago, and one that stands elsewhere than on the map although the gates accept it. (What
+        they reject shows that the robot is lost, where it is.)"""
+        updates, misplaced = state.updates, state.memory.calibration.residuals.misplaced
+        names = frozenset((misplaced,)) if misplaced else _NOBODY
+        if self._interval_ns == 0.0 and now_ns >= state.stamp_ns:
+            return names
+        return names.union(
             name for name in updates.objects_ns if self.is_cooling_down(updates, name, now_ns)
         )
 
     def usable(
-        self, updates: Updates, measurements: list[Measurement], now_ns: int
+        self,
+        updates: Updates,
+        measurements: list[Measurement],
+        now_ns: int,
+        unusable: frozenset[str],
     ) -> list[Measurement]:
         """The measurements of objects that may be used, those used not long ago inflated."""
-        usable = [m for m in measurements if not self.is_cooling_down(updates, m.source, now_ns)]
+        usable = [
+            m
+            for m in measurements
+            if m.source not in unusable and not self.is_cooling_down(updates, m.source, now_ns)
+        ]
         if self.inflates:
             usable = [m.inflated(self.inflation(updates, m.source, now_ns)) for m in usable]
         return usable

@@ -112,7 +112,7 @@ class OwnCalibration:
             return state
         now_ns, _, place, _, _, _, memory = state
         _, _, calibration, _ = memory
-        _, _, _, check, present, _, _, common, _, _, _ = calibration
+        _, _, _, check, present, _, _, common, *_ = calibration
         if common is not None and not common.is_precise:
             return state  # corrections of the pose tell of the camera
         begin, _, _, _, _, _, _, _, path_ns = check

@@ -110,6 +110,13 @@ class Parameters(NamedTuple):
         rows += [(0.0,) * n + row for row in covariance]
         return Parameters(tuple(rows), self.with_pose + (NO_COVARIANCE,) * m)
 
+    def without(self, first: int, number: int) -> "Parameters":
+        """Without so many of them from this one on."""
+        covariance, with_pose = self
+        last = first + number
+        rows = [row[:first] + row[last:] for row in covariance[:first] + covariance[last:]]
+        return Parameters(tuple(rows), with_pose[:first] + with_pose[last:])
+
     def with_derived(
         self,
         covariance: tuple[Numbers, ...],

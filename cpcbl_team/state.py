@@ -16,15 +16,11 @@ from cpcbl_team.config import Field, Start
 from cpcbl_team.estimate import HEADING, POSE, POSITION, ZERO3, Covariance3, Estimate, Scope
 from cpcbl_team.geometry import Pose2, new, wrap_angle
 from cpcbl_team.inputs import Belief, LandmarkBelief, Odometry, Sighting
+from cpcbl_team.landmark_readings import LandmarkReading
 from cpcbl_team.map_rejections import MapRejections
 from cpcbl_team.map_residuals import MapResiduals
-from cpcbl_team.miscalibration import (
-    AS_CONFIGURED,
-    Adaptation,
-    ModelCheck,
-    with_doubts,
-)
-from cpcbl_team.new_landmarks import LandmarkReading
+from cpcbl_team.miscalibration import AS_CONFIGURED, Adaptation, ModelCheck, with_doubts
+from cpcbl_team.moved_landmarks import Innovations, Moves
 from cpcbl_team.range_errors import RangeEvidence
 from cpcbl_team.self_calibration import ReferencePoses, SelfCalibration
 from cpcbl_team.sender_records import SenderRecord
@@ -183,6 +179,10 @@ class CalibrationMemory(NamedTuple):
     residuals: MapResiduals = MapResiduals()
     unplaced: Mapping[str, tuple[LandmarkReading, ...]] = _NONE
     """What was read of landmarks whose places are not known yet."""
+    innovations: Innovations = _NONE
+    """Of landmarks whose places the robot has found itself,"""
+    moved: Moves = _NONE
+    """and those of them that moved since then."""
     stationary: StationaryRecord | None = None  # None while it drives
 
     @property
@@ -197,7 +197,7 @@ class CalibrationMemory(NamedTuple):
 
     def misplaced(self, stamp_ns: int) -> str:
         """The object that must stand elsewhere than on the map; empty if there is none."""
-        return self.rejections.misplaced(stamp_ns) or self.residuals.misplaced()
+        return self.rejections.misplaced(stamp_ns) or self.residuals.misplaced
 
     @property
     def bearing_bias_rad(self) -> float:

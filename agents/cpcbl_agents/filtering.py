@@ -29,8 +29,8 @@ from cpcbl_team.inputs import (
     Sightings,
 )
 from cpcbl_team.localizer import Localizer
-from cpcbl_team.map_rejections import MISPLACED
 from cpcbl_team.miscalibration import percentages
+from cpcbl_team.misplacements import misplacements
 from cpcbl_team.places import map_object
 from cpcbl_team.self_calibration import SelfCalibration
 from cpcbl_team.sensors import recalibrated
@@ -97,8 +97,7 @@ class FilterAgent:
         state = self.timeline.state
         calibration = state.memory.calibration
         factors = percentages(calibration.adaptation)
-        if name := calibration.misplaced(state.stamp_ns):
-            factors[MISPLACED + name] = 1
+        factors |= misplacements(calibration, state.stamp_ns)
         return self.counts + Counter(self.timeline.state.counts) + Counter(factors)
 
     @property

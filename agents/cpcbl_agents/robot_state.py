@@ -4,7 +4,8 @@ import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Literal, NamedTuple, Protocol
 
-from cpcbl_team.map_rejections import MISPLACED
+from cpcbl_team.misplacements import MISPLACED, MOVES, REJECTED
+from cpcbl_team.moved_landmarks import MOST_MOVES
 from cpcbl_transport.messages import Status, Track
 
 SILENT_S = 2.0  # so long, and three of its pauses, a robot is silent before it is gone
@@ -90,8 +91,8 @@ def _problems(status: Status) -> Iterator[str]:
             distance, turn, bias_rad = status.learned
             text = f"{learned_text(distance, turn, math.degrees(bias_rad))}, {text}"
         yield f"miscalibrated: {text}"
-    for place in misplaced_objects(status.counts):
-        yield f"finds {place} elsewhere than on the map"
+    for place, text in misplaced_objects(status.counts).items():
+        yield f"finds {place} elsewhere than {text}"
 
 
 class Judged(Protocol):
@@ -146,9 +147,25 @@ def learned_text(distance_scale: float, turn_scale: float, bearing_bias_deg: flo
     return f"distance × {distance_scale:.2f}, turn × {turn_scale:.2f}, {turned}"
 
 
-def misplaced_objects(counts: Mapping[str, int]) -> Iterator[str]:
-    """The objects of the map that a robot finds elsewhere (docs/team_file.md)."""
-    return (name.removeprefix(MISPLACED) for name in counts if name.startswith(MISPLACED))
+def misplaced_objects(counts: Mapping[str, int]) -> dict[str, str]:
+    """The objects that a robot finds elsewhere, and elsewhere than what (docs/team_file.md): `on
+    the map: 0.52 m from there, not used`."""
+    texts = {}
+    for name in (n.removeprefix(MISPLACED) for n in counts if n.startswith(MISPLACED)):
+        distance_mm, moves = counts[MISPLACED + name], counts.get(MOVES + name, 0)
+        rejected, facts = counts.get(REJECTED + name, 0), []
+        if distance_mm > 1:
+            facts.append(f"{distance_mm / 1000.0:.2f} m from there")
+        if rejected:
+            facts.append(f"rejected {rejected} times of late")
+        if moves >= MOST_MOVES:
+            facts.append(f"{moves} times: it moves, or two have this name; not used")
+        elif not moves:
+            facts.append("not used")
+        elif distance_mm == 1:
+            facts.append("looked for")
+        texts[name] = f"{'before' if moves else 'on the map'}: {', '.join(facts)}"
+    return texts
 
 
 def distrust_reason(t: Judged) -> str:

@@ -55,18 +55,34 @@ def test_each_state_has_its_word_its_reasons_and_its_severity(
 
 
 def test_what_a_robot_says_of_teammates_calibration_and_map_is_a_problem() -> None:
-    counts = {**MISCALIBRATED, "misplaced_door": 1}
+    counts = {**MISCALIBRATED, "misplaced_door": 520, "rejected_door": 14}
     found = robot_state(latest(trust=(Trust("west", "biased"),), counts=counts))
     assert (found.word, found.problems) == (
         "problem",
         (
             "distrusts west (biased)",
             "miscalibrated: σ of its odometry × 2.1, 1.5% of observations rejected",
-            "finds door elsewhere than on the map",
+            "finds door elsewhere than on the map: 0.52 m from there, rejected 14 times of late,"
+            " not used",
         ),
     )
     learned = robot_state(latest(counts=MISCALIBRATED, learned=(0.9, 1.0, 0.0)))
     assert learned.why.startswith("miscalibrated: distance × 0.90, turn × 1.00")
+
+
+@pytest.mark.parametrize(
+    ("counts", "text"),
+    [
+        ({"misplaced_box": 1, "moves_box": 1}, "before: looked for"),
+        ({"misplaced_box": 980, "moves_box": 1}, "before: 0.98 m from there"),
+        (
+            {"misplaced_box": 980, "moves_box": 3},
+            "before: 0.98 m from there, 3 times: it moves, or two have this name; not used",
+        ),
+    ],
+)
+def test_a_landmark_that_moved_is_named_with_its_numbers(counts: dict[str, int], text: str) -> None:
+    assert robot_state(latest(counts=counts)).problems == (f"finds box elsewhere than {text}",)
 
 
 def test_what_an_observer_finds_comes_first() -> None:

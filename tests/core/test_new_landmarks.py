@@ -16,19 +16,27 @@ from support.core import (
     matrix2,
     position_error,
 )
+from support.sweeps import over_seeds
 
-from cpcbl_team.config import Field, Gives, LocalizerSettings, SensorSettings, Start, Unsurveyed
-from cpcbl_team.geometry import Pose2, wrap_angle
+from cpcbl_team.config import (
+    Field,
+    Gives,
+    LocalizerSettings,
+    OdometryNoise,
+    SensorSettings,
+    Start,
+    Unsurveyed,
+)
+from cpcbl_team.geometry import Pose2, step, wrap_angle
 from cpcbl_team.inputs import InitialPose, Sighting, Sightings
-from cpcbl_team.localizer import Localizer
-from cpcbl_team.new_landmarks import (
-    LEAST_READINGS,
+from cpcbl_team.landmark_readings import (
     MOST_READINGS,
     SPACING_NS,
     LandmarkReading,
-    relative_place,
     with_reading,
 )
+from cpcbl_team.localizer import Localizer
+from cpcbl_team.new_landmarks import LEAST_READINGS, relative_place
 from cpcbl_team.state import State
 
 BOX = (3.0, 1.0)
@@ -104,6 +112,37 @@ def test_a_place_is_as_certain_as_it_says(gives: Gives, path: tuple[Pose2, ...])
     assert len(values) > 40
     assert np.mean(values) < 2.6
     assert path is not STANDING or np.mean(values) > 1.4
+
+
+@over_seeds(60, 400)
+@pytest.mark.parametrize("gives", ["both", "range", "bearing"])
+def test_a_place_is_as_certain_as_it_says_beside_the_drift_of_odometry(
+    gives: Gives, seeds: range
+) -> None:
+    """What dead reckoning errs by at one reading it errs by at all older ones."""
+    values = []
+    for seed in seeds:
+        rng, heading = np.random.default_rng(seed), 0.0
+        believed = true = Pose2(0.0, 0.0, 0.0)
+        read: tuple[LandmarkReading, ...] = ()
+        for k in range(20):
+            (exact,) = readings((true,), gives, rng=rng)
+            read = with_reading(
+                read, exact._replace(stamp_ns=k * SPACING_NS, odometry_from_robot=believed)
+            )
+            heading = 0.15 if k % 10 < 7 else -0.1
+            believed, noise = step(believed, 0.25, heading), rng.normal(size=2)
+            around = math.hypot(0.05 * math.sqrt(0.25), 0.05 * math.sqrt(abs(heading)))
+            moved = 0.25 + 0.05 * math.sqrt(0.25) * float(noise[0])
+            true = step(true, moved, heading + around * float(noise[1]))
+        place = relative_place(read, believed, OdometryNoise())
+        if place is not None:
+            x, y = true.transform(place.x, place.y)
+            off = np.array([x - BOX[0], y - BOX[1]])
+            covariance = matrix2(place.covariance.rotated(true.heading))
+            values.append(float(off @ np.linalg.solve(covariance, off)))
+    assert len(values) > 0.4 * len(seeds)
+    assert 1.2 < np.mean(values) < 2.6
 
 
 def test_readings_are_kept_apart_and_for_some_time() -> None:

@@ -28,12 +28,11 @@ ENDPOINT = re.compile(r"(?<=--connect )(tcp/[\d.:]+|ENDPOINT)")
 PATIENCE_S = 60.0
 WATCHED = LIVE._replace(says="watched for", beside="team.toml")
 BUDGET = Way(EXPERIMENT, "long", "--team-size 2 --seeds 1")
-SHORT = "--duration 12"
-LEDGER = "run, 60 s", "what each was worth"
+SHORT, UNCERTAIN = "--duration 12", "worlds --worlds uncertain,unsurveyed"
+LEDGER, GUEST = ("run, 60 s", "what each was worth"), "before, during and after guest"
 LIAR, TABLE_1 = ("one liar, 2 honest",), ("errors at waypoints",)
 OVAL = ("navigator, 5 loops, 20 runs",)
 FIGURE_7 = "navigator, 5 loops, 50 runs", "navigator with a camera, 5 loops"
-GUEST = "before, during and after guest"
 TRIPOD = "tripod took part", f"{GUEST} tripod"
 SIMULATED = "errors of position and heading"
 CALIBRATED = "way, true = scale x reported"
@@ -104,7 +103,6 @@ WAYS = {
     "cpcbl-team experiment figure7-cameras": Way(
         EXPERIMENT, "long", "--seeds 1", shows=FIGURE_7[1:]
     ),
-    "cpcbl-team experiment liars": ONE_SEED,
     "cpcbl-team experiment liars --seeds 4": Way(EXPERIMENT, "long", "--seeds 1", shows=LIAR),
     "cpcbl-team experiment luck": Way("histories", "trial", "--seeds 1 --duration 8 --jobs 1"),
     "cpcbl-team experiment one-way-vs-both": Way(
@@ -112,8 +110,10 @@ WAYS = {
     ),
     "cpcbl-team experiment table1": Way(EXPERIMENT, "long", "--seeds 1", shows=TABLE_1),
     "cpcbl-team experiment table1 --seeds 20": Way(EXPERIMENT, "long", "--seeds 2"),
-    "cpcbl-team experiment worlds": ONE_SEED,
-    "cpcbl-team experiment worlds --worlds uncertain,unsurveyed": ONE_SEED,
+    **{
+        f"cpcbl-team experiment {name}": ONE_SEED
+        for name in ("liars", "mapping", "worlds", UNCERTAIN, "wrong-maps")
+    },
     "cpcbl-team bridge access team.toml > access.json5": Way("access_control"),
     "cpcbl-team bridge ros2 team.toml": LIVE._replace(says="in ROS 2 at", beside="router"),
     "cpcbl-team gateway team.toml": LIVE._replace(

@@ -1,11 +1,12 @@
 """What a driver probably got wrong, judged by messages that it sent. Pure functions, no clock."""
 
+import cmath
 import math
 from collections.abc import Iterable, Sequence
 from itertools import pairwise
 from statistics import median
 
-from cpcbl_team.inputs import Odometry, Sightings
+from cpcbl_team.inputs import Odometry, Sighting, Sightings
 
 YEAR_NS = 31_557_600_000_000_000
 UNIX_NS = 1_000_000_000_000_000_000  # in 2001: a clock that is behind that counts from elsewhere
@@ -104,7 +105,12 @@ def range_cause(
     """What ranges look like that are far beyond the sensor's reach and the field's diagonal (m), or
     that make distances between landmarks `scale` times as long as on the map."""
     if unit := unit_of(scale):
-        return f"ranges look like {unit}"
+        return (
+            f"ranges look like {unit}: landmarks are {scale:.1f} times as far apart as on the map"
+        )
+    if unit := unit_of(1.0 / scale if scale > 0.0 else 0.0):
+        times = f"{1.0 / scale:.1f} times as far apart as they are seen"
+        return f"the map looks as if it were in {unit}: its landmarks are {times}"
     ranges = [s.range_m for f in frames for s in f.sightings if s.range_m is not None]
     if len(ranges) < LEAST_CASES:
         return ""
@@ -113,6 +119,34 @@ def range_cause(
         return ""
     unit = "millimetres" if range_m > 100.0 * max_range_m else "millimetres or centimetres"
     return f"ranges of {range_m:.0f}, but the sensor sees {max_range_m:g} m: they look like {unit}"
+
+
+def twice_cause(frames: Iterable[Sightings]) -> str:
+    """Which object frames have twice, and how far apart (m, median): two with one name, or one that
+    is detected twice. Empty without any."""
+    apart: dict[str, list[float]] = {}
+    for frame in frames:
+        seen: dict[str, Sighting] = {}
+        for s in frame.sightings:
+            first = seen.setdefault(s.id, s)
+            if first is not s:
+                apart.setdefault(s.id, []).append(_apart_m(first, s))
+    if not apart:
+        return ""
+    name, distances_m = max(apart.items(), key=lambda item: len(item[1]))
+    between_m = median(distances_m)
+    far = f", {between_m:.1f} m apart" if between_m > 0.0 else ""
+    return f"`{name}` comes twice in one message{far}; do two objects have this name?"
+
+
+def _apart_m(a: Sighting, b: Sighting) -> float:
+    """How far apart two sightings put an object (m); 0 if neither has a range."""
+    if a.range_m is None or b.range_m is None:
+        return 0.0
+    if a.bearing_rad is None or b.bearing_rad is None:
+        return abs(a.range_m - b.range_m)
+    p, q = cmath.rect(a.range_m, a.bearing_rad), cmath.rect(b.range_m, b.bearing_rad)
+    return abs(p - q)
 
 
 def unit_of(scale: float) -> str:

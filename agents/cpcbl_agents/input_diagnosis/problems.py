@@ -217,6 +217,8 @@ def _refusal_cause(reason: str, key: str, window: InputWindow, facts: InputFacts
             cause = f"payloads cannot be decoded: {problem[:120]}"
     elif reason == "bearing_out_of_range":
         cause = causes.bearing_cause(frames)
+    elif reason == "seen_twice":
+        cause = causes.twice_cause(frames)
     elif reason == "unknown_object":
         cause = _unknown_names(frames, facts)
     elif reason == "duplicate" and has_overlap(window):
@@ -267,9 +269,8 @@ def _pieces(window: InputWindow) -> list[Odometry]:
 
 
 def _implausible(facts: InputFacts) -> Iterator[tuple[str, str]]:
-    nothing = InputWindow(0.0)
-    odometry = facts.windows.get("odometry", nothing)
-    positions = facts.windows.get("position", nothing).recent
+    odometry = facts.windows.get("odometry", InputWindow(0.0))
+    positions = facts.windows.get("position", InputWindow(0.0)).recent
     pieces = _odometry(facts)
     frames = [_usable(frame) for frame in facts.frames]
     overlap = bool(pieces) and has_overlap(odometry)
@@ -305,7 +306,7 @@ def _motion(
         return f"sightings: {cause}"
     right_order, wrong_order = motions.order_votes(frames[-5:], marks)
     if wrong_order >= causes.LEAST_CASES and wrong_order > 4 * right_order:
-        return f"sightings: {mistakes.MIRRORED}"
+        return f"sightings: {mistakes.MIRRORED}; or the map is mirrored"
     tolerance = 0.15 + 3.0 * math.hypot(sensor.range_share, sensor.bearing_sigma_rad)
     tolerance = min(tolerance, MOST_TOLERANCE)
     soon = list(motions.resightings(frames, steps, marks))

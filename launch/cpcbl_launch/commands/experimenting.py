@@ -154,6 +154,22 @@ def worlds(
     conduct(experiment.EXPERIMENT._replace(cases=cases), seeds, where, output, as_json)
 
 
+_add_command(
+    "mapping",
+    "mapping:EXPERIMENT",
+    50,
+    "Teams that find all landmarks while they drive, beside the same teams on the surveyed map.",
+)
+
+
+_add_command(
+    "wrong-maps",
+    "wrong_maps:EXPERIMENT",
+    20,
+    "Landmarks that are pushed, or of one name; maps that are mirrored or in other units.",
+)
+
+
 @experiment_app.command("luck")
 def luck(
     seeds: Annotated[int, Option(min=1, help="Histories, each of its own seed.")] = 20,

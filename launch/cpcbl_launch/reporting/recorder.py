@@ -33,6 +33,7 @@ from cpcbl_launch.reporting.statuses import (
     TrustReport,
     are_limits_kept,
     input_reports,
+    is_figure,
     summed_flows,
     summed_spending,
     trust_reports,
@@ -331,7 +332,7 @@ class Recorder:
         for status in statuses:
             counts.update(status.counts)
         latest = statuses[-1].counts if statuses else {}
-        percentages = {name: n for name, n in latest.items() if name.endswith("_percent")}
+        percentages = {name: n for name, n in latest.items() if is_figure(name)}
         return RobotReport(
             **msgspec.structs.asdict(figures),
             variant=variant,

@@ -8,6 +8,7 @@ import msgspec
 
 from cpcbl_agents.input_diagnosis.problems import without_numbers
 from cpcbl_agents.robot_state import distrust_reason
+from cpcbl_team.misplacements import MISPLACED, MOVES, REJECTED
 from cpcbl_transport.messages import Flow, Spending, Status
 
 
@@ -195,3 +196,8 @@ def trust_remarks(robot: str, trust: Iterable[TrustReport]) -> Iterator[str]:
             yield f"robot {robot} cannot decide whether {t.peer} is right: no majority"
         elif t.quarantines:
             yield f"robot {robot} did not believe {t.peer} for a time ({times})"
+
+
+def is_figure(count: str) -> bool:
+    """Whether a count of a status is no number of events, so that those of processes are no sum."""
+    return count.endswith("_percent") or count.startswith((MISPLACED, MOVES, REJECTED))

@@ -76,18 +76,23 @@ class SimulatedField:
 
             self._cameras = Cameras(replace(team, map=self._map), seed)
         self.skipped_frames = 0  # frames that were due in steps without pictures
-        landmarks = self._map.landmarks.items()
-        self._landmarks = [VisibleObject(name, m.x_m, m.y_m, m.gives) for name, m in landmarks]
-        self._landmarks_to_bump = Grid(team.simulation.bump_radius_m, self._landmarks)
         self._start_ns = start_ns
         self._events = deque(sorted(team.simulation.events, key=lambda event: event.at_s))
         self._hidden_until_ns = start_ns
+        landmarks = self._map.landmarks.items()
+        self.place_landmarks(VisibleObject(name, m.x_m, m.y_m, m.gives) for name, m in landmarks)
+
+    def place_landmarks(self, landmarks: Iterable[VisibleObject]) -> None:
+        """These landmarks stand on the field from now on, and no others; two may have one name.
+        (Cameras show those of the map.)"""
+        self.landmarks = tuple(landmarks)
+        self._landmarks_to_bump = Grid(self.team.simulation.bump_radius_m, self.landmarks)
         self._update_sensing_range()
 
     def _update_sensing_range(self) -> None:
         ranges_m = [robot.settings.sensor.max_range_m for robot in self.robots.values()]
         self._reach_m = max(ranges_m, default=0.0)
-        self._landmarks_to_see = Grid(self._reach_m, self._landmarks)
+        self._landmarks_to_see = Grid(self._reach_m, self.landmarks)
 
     def add_guest(self, name: str, model: SimulatedRobotModel) -> None:
         """A guest has a body from now on. Its noise is its own: the others' stays what it was."""

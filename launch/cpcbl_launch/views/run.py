@@ -288,8 +288,8 @@ def _remarks(report: Report, is_wide: bool) -> Iterator[str]:
             yield f"Robot {name} calibrated itself: {text}."
         if text := miscalibration_text(r.counts, r.learned):
             yield f"Robot {name} is miscalibrated: {text}. Run `cpcbl-team calibrate`."
-        for place in misplaced_objects(r.counts):
-            yield f"Robot {name} finds {place} elsewhere than on the map; measure its place again."
+        for place, text in misplaced_objects(r.counts).items():
+            yield f"Robot {name} finds {place} elsewhere than {text}. Measure its place again."
     for name, r in report.robots.items():
         yield from problem_remarks(name, r.problems)
         yield from trust_remarks(name, r.trust)

@@ -324,7 +324,7 @@ def test_the_remark_says_what_is_wrong_with_the_settings(tmp_path: Path) -> None
     text = (
         "Robot 1 is miscalibrated: σ of its odometry × 2.1, 1.5% of observations rejected."
         " Run `cpcbl-team calibrate`."
-        " Robot 1 finds m2 elsewhere than on the map; measure its place again."
+        " Robot 1 finds m2 elsewhere than on the map: not used. Measure its place again."
     )
     shown = " ".join(printed(msgspec.structs.replace(evaluation, robots=robots)))
     assert text in " ".join(shown.split())

@@ -12,6 +12,7 @@ from cpcbl_launch.team.file import builtin_path, load_team
 from cpcbl_launch.team.overrides import with_blind_robots
 from cpcbl_team.config import (
     Field,
+    Gives,
     LandmarkPosition,
     OdometrySettings,
     PositionSensor,
@@ -73,11 +74,18 @@ def _hidden(every_s: float, duration_s: float) -> list[SimulationEvent]:
     return [SimulationEvent(at_s=t, hide_landmarks_s=every_s - 1.0) for t in times]
 
 
-def _seeing(seeing: str, *events: SimulationEvent, ahead: bool = False) -> World:
-    """Robots a, b, c, d on one circuit among four landmarks, of which some see landmarks. With
-    `ahead` each sees only the teammate ahead of it."""
-    robots = {name: all_robots().robots[name] for name in "abcd"}
-    team = _team(robots, _field(4), *events)
+def circuit_world(
+    seeing: str,
+    *events: SimulationEvent,
+    ahead: bool = False,
+    robots: str = "abcd",
+    places: int = 4,
+    gives: Gives = "both",
+) -> World:
+    """These robots on one circuit among landmarks, of which some see landmarks. With `ahead` each
+    sees only the teammate ahead of it."""
+    chosen = {name: all_robots().robots[name] for name in robots}
+    team = _team(chosen, _field(places, gives), *events)
     if ahead:
         team = with_settings(team, None, sensor={"field_of_view_deg": 60.0})
     blind = [name for name in robots if name not in seeing]
@@ -168,12 +176,12 @@ def _team_worlds() -> dict[str, World]:
             team = with_settings(team, "helper", start=start, collaboration=each)
             found[name] = World(team, ("r",))
     rare = _hidden(10.0, DURATION_S)
-    found["chain, the first sees landmarks"] = _seeing("a", ahead=True)
-    found["clique, one sees landmarks"] = _seeing("a")
-    found["clique, two see landmarks"] = _seeing("ac")
-    found["clique, landmarks 1 s in 10"] = _seeing("abcd", *rare)
+    found["chain, the first sees landmarks"] = circuit_world("a", ahead=True)
+    found["clique, one sees landmarks"] = circuit_world("a")
+    found["clique, two see landmarks"] = circuit_world("ac")
+    found["clique, landmarks 1 s in 10"] = circuit_world("abcd", *rare)
     found["mixed team"] = _mixed_team()
-    found["ring, landmarks 1 s in 10"] = _seeing("abcd", *rare, ahead=True)
+    found["ring, landmarks 1 s in 10"] = circuit_world("abcd", *rare, ahead=True)
     return found
 
 
@@ -181,7 +189,7 @@ def _mixed_team() -> World:
     """On one circuit: a robot that sees landmarks, one with poor sensors and poor odometry that
     sees them too, one that sees only teammates, and one with a position sensor alone. In the middle
     stands the helper."""
-    team = _seeing("ab").team
+    team = circuit_world("ab").team
     poor = {
         "sensor": {"range_share": 0.15, "bearing_sigma_deg": 9.0},
         "odometry": {"turn_sigma_rad_per_sqrt_rad": 0.15},
@@ -236,9 +244,9 @@ def _uncertain_map_worlds() -> dict[str, World]:
     rare = _hidden(10.0, DURATION_S)
     for name, world in (
         ("landmarks 1 s in 10", World(_alone(_field(4), *rare), ("r",))),
-        ("clique", _seeing("abcd")),
-        ("clique, one sees landmarks", _seeing("a")),
-        ("ring, landmarks 1 s in 10", _seeing("abcd", *rare, ahead=True)),
+        ("clique", circuit_world("abcd")),
+        ("clique, one sees landmarks", circuit_world("a")),
+        ("ring, landmarks 1 s in 10", circuit_world("abcd", *rare, ahead=True)),
     ):
         found[f"uncertain map, {name}"] = world._replace(team=_with_uncertain_map(world.team))
     return found
@@ -249,21 +257,21 @@ def _unsurveyed_worlds() -> dict[str, World]:
     found: dict[str, World] = {}
     for gives, text in KINDS:
         for known in (0, 2):
-            team = _with_unsurveyed(_alone(_field(8, gives)), known)
+            team = with_unsurveyed(_alone(_field(8, gives)), known)
             name = f"unsurveyed{text}, {known} of 8 known"
             found[name] = World(team, ("r",), duration_s=LEARNING_S)
     rare = _hidden(10.0, LEARNING_S)
-    team = _with_unsurveyed(_alone(_field(8), *rare), 0)
+    team = with_unsurveyed(_alone(_field(8), *rare), 0)
     found["unsurveyed, landmarks 1 s in 10"] = World(team, ("r",), duration_s=LEARNING_S)
     for seeing in ("a", "abcd"):
-        team = _with_unsurveyed(_seeing(seeing).team, 0)
+        team = with_unsurveyed(circuit_world(seeing).team, 0)
         name = f"unsurveyed, clique, {len(seeing)} of 4 see landmarks"
         found[name] = World(team, tuple("abcd"), duration_s=LEARNING_S)
     for seeing in ("ab", "abcd"):
-        guided = _with_guide(_seeing(seeing).team, "a")
+        guided = _with_guide(circuit_world(seeing).team, "a")
         name = f"unsurveyed, clique, {len(seeing)} of 4 see landmarks, one knows them"
         found[name] = World(guided, tuple("abcd"), duration_s=LEARNING_S)
-    guided = _with_guide(_seeing("abcd").team, "a")
+    guided = _with_guide(circuit_world("abcd").team, "a")
     searching = {n: r if n == "a" else replace(r, start=None) for n, r in guided.robots.items()}
     guided = replace(guided, robots=searching)
     world = World(guided, tuple("abcd"), duration_s=LEARNING_S, scored_from_s=10.0)
@@ -275,10 +283,10 @@ def _with_guide(team: Team, guide: str) -> Team:
     """The team of which one robot alone knows where all landmarks stand."""
     known = {n: LandmarkPosition(x_m=m.x_m, y_m=m.y_m) for n, m in team.map.landmarks.items()}
     robots = {**team.robots, guide: replace(team.robots[guide], known_landmarks=known)}
-    return _with_unsurveyed(replace(team, robots=robots), 0)
+    return with_unsurveyed(replace(team, robots=robots), 0)
 
 
-def _with_unsurveyed(team: Team, known: int) -> Team:
+def with_unsurveyed(team: Team, known: int) -> Team:
     """The team that knows the places of so many landmarks only."""
     marks = list(team.map.landmarks.items())
     unsurveyed = {

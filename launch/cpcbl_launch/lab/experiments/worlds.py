@@ -10,7 +10,7 @@ the mean over runs (95 %). A consistent filter has a NEES of 2 and 98.9 % inside
 """
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from functools import partial
 from random import Random
 from typing import NamedTuple
@@ -113,11 +113,14 @@ def with_true_starts(team: Team, seed: int) -> Team:
     return replace(team, robots=robots)
 
 
-def run_world(world: World, seed: int) -> list[WorldRun]:
-    """One run of a world: the figures of each scored robot."""
+def run_world(
+    world: World, seed: int, watch: Callable[[Bus], object] = lambda bus: None
+) -> list[WorldRun]:
+    """One run of a world: the figures of each scored robot. `watch` may subscribe to it."""
     wrappers = {name: partial(_lossy_bus, world, seed, name) for name in world.team.robots}
     truth = with_true_starts(world.truth or world.team, seed)
-    _, recorder = simulate(world.team, seed, world.duration_s, truth, bus_wrappers=wrappers)
+    team, length_s = world.team, world.duration_s
+    _, recorder = simulate(team, seed, length_s, truth, watch, bus_wrappers=wrappers)
     true_paths = recorder.simulated_truth()
     return [_figures(world, name, recorder, true_paths[name]) for name in world.scored]
 
@@ -201,16 +204,18 @@ def row(world: str, variant: str, runs: list[list[WorldRun]]) -> dict[str, objec
     return figures | {
         "position_rmse_m": math.sqrt(float(np.mean(rmse**2))),
         "nees": float(np.mean(nees)),
-        "nees_bound": _bound(nees),
+        "nees_bound": mean_bound(nees),
         "heading_nees": float(np.mean(heading)),
         "inside_3_sigma": float(np.mean(inside)),
         "verdict": verdict(
-            (float(np.mean(nees)), _bound(nees)), (float(np.mean(inside)), _bound(inside)), beyond
+            (float(np.mean(nees)), mean_bound(nees)),
+            (float(np.mean(inside)), mean_bound(inside)),
+            beyond,
         ),
     }
 
 
-def _bound(values: Floats) -> float:
+def mean_bound(values: Floats) -> float:
     """Half the width of the 95 % bounds of the mean of independent values."""
     if len(values) < 2:
         return math.inf
