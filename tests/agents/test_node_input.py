@@ -337,12 +337,12 @@ def test_a_step_ends_although_more_and_more_arrives(monkeypatch: pytest.MonkeyPa
     robot = stand.robots["me"]
     handle = robot.handle
 
-    def answered_at_once(message: Any, now_ns: int) -> list[Outgoing]:
+    def answered_at_once(message: Any, now_ns: int, frame: str = "") -> list[Outgoing]:
         nonlocal answered
         if isinstance(message, Position) and answered < 100:
             answered += 1
             stand.put(IN_POSITION, POSITION)
-        return handle(message, now_ns)
+        return handle(message, now_ns, frame)
 
     monkeypatch.setattr(robot, "handle", answered_at_once)
     stand.put(IN_POSITION, POSITION)

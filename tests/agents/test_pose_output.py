@@ -82,6 +82,7 @@ def test_json_is_sent_to_those_who_ask_for_it() -> None:
         "covariance": (),
         "lost": "",
         "unconfirmed": "",
+        "frame": "",
     }
     assert json.loads(status_ear.payloads[0])["counts"]["odometry"] == 10
 
