@@ -21,14 +21,6 @@ def test_a_robot_that_finds_all_landmarks_knows_how_far_it_errs(gives: str, seed
     assert found["lost_share"] == 0.0
 
 
-@pytest.mark.long
-@pytest.mark.timeout(4 * 3600)
-@pytest.mark.parametrize("key", cases(), ids="/".join)
-def test_no_team_that_finds_its_landmarks_is_overconfident(key: tuple[str, str, str]) -> None:
-    found = row(key, [run_mapping(cases()[key], seed) for seed in range(1, 13)])
-    assert found["verdict"] != "overconfident"
-
-
 def test_a_blind_robot_has_no_places_and_counts_for_the_poses_alone() -> None:
     blind = RUN._replace(place_nees=math.nan, bytes_sent=0)
     found = row(("ac", "a", "both"), [[RUN, blind], [RUN, blind]])
