@@ -103,7 +103,7 @@ WAYS = {
     "cpcbl-team experiment figure7-cameras": Way(
         EXPERIMENT, "long", "--seeds 1", shows=FIGURE_7[1:]
     ),
-    "cpcbl-team experiment liars --seeds 4": Way(EXPERIMENT, "long", "--seeds 1", shows=LIAR),
+    "cpcbl-team experiment liars --seeds 3": Way(EXPERIMENT, "long", "--seeds 1", shows=LIAR),
     "cpcbl-team experiment luck": Way("histories", "trial", "--seeds 1 --duration 8 --jobs 1"),
     "cpcbl-team experiment one-way-vs-both": Way(
         EXPERIMENT, "trial", "--team-sizes 2 --seeds 1", shows=("robots that move",)
