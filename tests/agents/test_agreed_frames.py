@@ -6,7 +6,7 @@ from statistics import fmean
 
 import pytest
 from msgspec.structs import replace
-from support.agreed_frames import LossyBus, World, bare, unmapped
+from support.agreed_frames import LossyBus, World, bare, two_halves, unmapped
 from support.sweeps import over_seeds
 
 from cpcbl_agents.frame_candidates import LOST_NS
@@ -65,6 +65,17 @@ def test_without_any_landmark_they_find_each_other(seeds: range) -> None:
     """With 16 seeds of 60 s the NEES was 1.5 on average; after 25 s at most all were in one."""
     worlds = [World(bare(), seed).run(30.0) for seed in seeds]
     assert all(set(world.frames.values()) == {PIONEERS} for world in worlds)
+    assert_right(*worlds)
+
+
+@over_seeds(1, 8)
+def test_two_halves_that_meet_on_the_way_are_in_one_frame(seeds: range) -> None:
+    worlds = [World(two_halves(), seed) for seed in seeds]
+    for world in worlds:
+        assert len(set(world.run(3.0).frames.values())) > 1  # they cannot see each other yet
+        world.run(57.0)
+        assert world.one_frame_after_s() < 45.0
+        assert set(world.frames.values()) == {frame_name("a1", 0)}
     assert_right(*worlds)
 
 

@@ -16,7 +16,7 @@ from cpcbl_launch.simulation.field import SimulatedField
 from cpcbl_launch.simulation.field_node import FieldNode
 from cpcbl_launch.simulation.in_process import run_nodes
 from cpcbl_launch.team.file import builtin_path, load_team
-from cpcbl_team.config import Field, Team
+from cpcbl_team.config import Field, Start, Team
 from cpcbl_team.tiers import LOWEST_TIER
 from cpcbl_transport.bus import Bus, BusProxy, Publisher, PublisherProxy
 from cpcbl_transport.memory_bus import MemoryHub
@@ -198,3 +198,30 @@ def unmapped() -> Team:
 def bare() -> Team:
     """The same without any landmark: its robots see nothing but each other."""
     return replace(unmapped(), map=Field(frame="agreed"))
+
+
+def two_halves() -> Team:
+    """Two robots at each end of a row of landmarks, too far apart to see each other; they drive to
+    its middle and back."""
+    team = unmapped()
+    mark, robot = team.map.unsurveyed["north"], team.robots["second"]
+    places = [(5.0 * column - 1.5, y) for column in range(5) for y in (-1.5, 4.5)]
+    marks = {f"l{n}": replace(mark, true_m=place) for n, place in enumerate(places)}
+    ways = {
+        "a1": ((0.0, 0.0), (8.0, 0.0), (8.0, 3.0), (0.0, 3.0), (0.0, 0.0)),
+        "a2": ((1.0, 3.0), (0.0, 1.0), (7.0, 1.0), (7.0, 2.0), (0.0, 2.0)),
+        "b1": ((18.0, 0.0), (10.0, 0.0), (10.0, 3.0), (18.0, 3.0), (18.0, 0.0)),
+        "b2": ((17.0, 3.0), (18.0, 1.0), (11.0, 1.0), (11.0, 2.0), (18.0, 2.0)),
+    }
+    robots = {name: replace(robot, **_on(way)) for name, way in ways.items()}
+    sensor = replace(robot.sensor, max_range_m=5.0)
+    robots = {name: replace(r, sensor=sensor) for name, r in robots.items()}
+    return replace(team, map=replace(team.map, unsurveyed=marks), robots=robots)
+
+
+def _on(way: tuple[tuple[float, float], ...]) -> dict[str, object]:
+    """The settings of a robot that drives from the first of these places to the others."""
+    (x, y), (to_x, to_y) = way[:2]
+    turn_deg = math.degrees(math.atan2(to_y - y, to_x - x))
+    start = Start(x_m=x, y_m=y, heading_deg=turn_deg, known=False)
+    return {"start": start, "waypoints_m": way[1:]}
