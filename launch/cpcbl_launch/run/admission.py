@@ -190,9 +190,9 @@ def shut_down(peers: Sequence[str]) -> int:
 def _connections_to(wanted: Collection[tuple[str, str]]) -> Iterator[socket.socket]:
     for name in os.listdir(OPEN_FILES) if wanted else ():
         with suppress(OSError), _connection(int(name)) as connection:
-            host, port, *_ = connection.getpeername()
-            if _canonical(f"{host}:{port}") in wanted:
-                yield connection
+            match connection.getpeername():
+                case (str(host), int(port), *_) if _canonical(f"{host}:{port}") in wanted:
+                    yield connection
 
 
 def _connection(descriptor: int) -> socket.socket:

@@ -124,6 +124,8 @@ def test_only_the_connections_to_these_peers_are_shut_down(listener: socket.sock
             stack.enter_context(socket.create_connection(listener.getsockname())) for _ in range(2)
         ]
         served = [stack.enter_context(listener.accept()[0]) for _ in range(2)]
+        for local in socket.socketpair():  # whose peers have no host
+            stack.enter_context(local)
         host, port = clients[0].getsockname()
         assert shut_down([f"[::ffff:{host}]:{port}"]) == 1
         assert clients[0].recv(1) == served[0].recv(1) == b""
