@@ -153,13 +153,14 @@ class BeliefShared(msgspec.Struct, frozen=True, array_like=True, tag="told"):
 
 
 class InputsMended(msgspec.Struct, frozen=True, array_like=True, tag="mended"):
-    """This robot's inputs were wrong until now: they tell nothing of its calibration, and made
-    teammates look wrong. They have turned its heading by `-turn_rad`, and may have moved its
-    position by `position_sigma_m`."""
+    """This robot's inputs were wrong from `since_ns` until now (0: nobody knows since when): they
+    tell nothing of its calibration, and made teammates look wrong. They have turned its heading by
+    `-turn_rad`, and may have moved its position by `position_sigma_m`."""
 
     stamp_ns: int
     turn_rad: float = 0.0
     position_sigma_m: float = 0.0
+    since_ns: int = 0
 
 
 class FrameChange(msgspec.Struct, frozen=True, array_like=True, tag="frame_change"):

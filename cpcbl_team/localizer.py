@@ -44,6 +44,7 @@ from cpcbl_team.prediction import Prediction
 from cpcbl_team.recovery import Recovery, with_innovations
 from cpcbl_team.recovery_evidence import (
     evidence_from_observation,
+    is_in_quarantine,
     recently_recorded,
     with_evidence,
     with_measurements,
@@ -353,8 +354,7 @@ class Localizer:
     def _record_observation(self, state: State, observation: PoseObservation) -> State:
         """With this as evidence of where the robot is, unless its sender is in quarantine."""
         memory = state.memory.teammates
-        sender = memory.senders.get(observation.sender)
-        if sender is None or not sender.reason:
+        if not is_in_quarantine(state, observation.sender):
             evidence = evidence_from_observation(state, observation)
             state = with_recovery(state, with_evidence(state.memory.recovery, [evidence]))
         if observation.observer is not None:

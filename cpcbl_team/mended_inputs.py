@@ -9,8 +9,8 @@ from cpcbl_team.trust import forgive
 
 def with_mended_inputs(state: State, event: InputsMended) -> State:
     """The state with its heading turned back, and less certain by what the wrong inputs may have
-    done. The teammates that they made look wrong are no longer blamed, and the pose from before
-    them is no longer trusted."""
+    done. The teammates that they made look wrong are no longer blamed, those that were blamed
+    before are. The pose from before them is no longer trusted."""
     (x, y, heading), covariance, shared = state.estimate
     p, h = event.position_sigma_m**2, event.turn_rad**2
     grown = covariance.plus(Covariance3(p, 0.0, p, 0.0, 0.0, h))
@@ -19,5 +19,5 @@ def with_mended_inputs(state: State, event: InputsMended) -> State:
     recovery = state.memory.recovery._replace(trusted=None, mistake="", suspected_ns=-1)
     state = with_recovery(state, recovery)
     teammates = state.memory.teammates
-    senders = forgive(teammates.senders, event.stamp_ns)
+    senders = forgive(teammates.senders, event.stamp_ns, event.since_ns)
     return with_teammates(state, with_senders(teammates, senders))

@@ -69,14 +69,21 @@ def with_evidence(memory: RecoveryMemory, pieces: Sequence[Evidence]) -> Recover
 
 
 def with_measurements(state: State, measurements: Sequence[Measurement]) -> RecoveryMemory:
-    """The memory with those of a frame's measurements that are not too alike to what it holds."""
+    """The memory with those of a frame's measurements that are not too alike to what it holds, and
+    do not rest on a teammate in quarantine."""
     memory = state.memory.recovery
     recent = recently_recorded(memory, state.stamp_ns)
     usable = [m for m in measurements if m.has_reading and m.wall is None and not m.is_for_heading]
-    new = [m for m in usable if m.source not in recent]
+    new = [m for m in usable if m.source not in recent and not is_in_quarantine(state, m.sender)]
     if not new:
         return memory
     return with_evidence(memory, [evidence_from_measurement(state, m) for m in new])
+
+
+def is_in_quarantine(state: State, sender: str) -> bool:
+    """Whether this teammate is: then nothing that it sends is evidence."""
+    record = state.memory.teammates.senders.get(sender)
+    return record is not None and record.reason is not None
 
 
 def without_senders(memory: RecoveryMemory, senders: Collection[str]) -> RecoveryMemory:

@@ -359,11 +359,13 @@ def reset_scores(senders: SenderRecords) -> SenderRecords:
     return {n: r if r.reason else replace(r, score=0.0) for n, r in senders.items()}
 
 
-def forgive(senders: SenderRecords, now_ns: int) -> SenderRecords:
-    """The records after the robot found an error of its own: what disagreed with its estimate may
-    have been right."""
+def forgive(senders: SenderRecords, now_ns: int, since_ns: int = 0) -> SenderRecords:
+    """The records after the robot found an error of its own, which it has had since then: what
+    disagreed with its estimate may have been right. An older quarantine has another cause."""
     return {
-        n: released(r, now_ns) if r.reason in _BY_COMPARISON else replace(r, score=0.0)
+        n: released(r, now_ns)
+        if r.reason in _BY_COMPARISON and r.since_ns >= since_ns
+        else replace(r, score=0.0)
         for n, r in senders.items()
     }
 

@@ -310,7 +310,7 @@ class Node:
         inputs, problems = self._health.judge(snapshot, now_ns, self.arrivals.has_namesake)
         is_contradicted = bool(snapshot.mistake) and self._health.is_mistake_contradicted
         if self._health.are_mended or is_contradicted:
-            self.robot.forget_wrong_inputs(now_ns)
+            self.robot.forget_wrong_inputs(self._health.wrong_since_ns, now_ns)
         overload = self._load.judge(*self.arrivals.pop_overflow())
         problems = (*overload, *problems, *self.robot.sensing.problems, *self._tape.problems)
         self._note_confirmation()

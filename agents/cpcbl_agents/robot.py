@@ -130,11 +130,11 @@ class Robot:
                 self._shared_ns = sent.stamp_ns
                 self.filter.handle(BeliefShared(sent.stamp_ns), now_ns)
 
-    def forget_wrong_inputs(self, now_ns: int) -> None:
+    def forget_wrong_inputs(self, since_ns: int, now_ns: int) -> None:
         """Discards what the filter adapted while inputs were wrong: call it when the monitor finds
-        them right again."""
+        them right again. `since_ns`: when it began to find them wrong."""
         latest = self.filter.timeline.latest(now_ns)
-        self.filter.handle(InputsMended(latest.stamp_ns), now_ns)
+        self.filter.handle(InputsMended(latest.stamp_ns, since_ns=since_ns), now_ns)
 
     def input_snapshot(self) -> InputSnapshot:
         """The state of the inputs now."""

@@ -11,12 +11,14 @@ import msgspec
 import pytest
 from support.buses import SECOND, robot_at
 
+from cpcbl_agents.agent import AgentMessage
+from cpcbl_agents.input_diagnosis.monitor import SELDOM
 from cpcbl_agents.input_diagnosis.problems import without_numbers
 from cpcbl_agents.node import Node, NodeCallbacks, NodeStart
 from cpcbl_agents.robot import build_robot
 from cpcbl_team.config import Field, Landmark, OdometrySettings, RobotSettings, Team
 from cpcbl_team.geometry import wrap_angle
-from cpcbl_team.inputs import Odometry, Position, Sighting, Sightings
+from cpcbl_team.inputs import InputsMended, Odometry, Position, Sighting, Sightings
 from cpcbl_transport import topics
 from cpcbl_transport.memory_bus import MemoryHub
 from cpcbl_transport.messages import Frame, SensorInput, Status, decode_tagged, encode
@@ -258,6 +260,27 @@ def test_a_problem_ends_some_seconds_after_its_cause() -> None:
     assert driver.run(15.0) == ()
     assert driver.run(5.0, without_odometry)
     assert driver.run(1.0) == ()
+
+
+def test_only_what_inputs_did_while_they_were_wrong_is_forgotten() -> None:
+    """A quarantine that is older has another cause."""
+    driver = Driver()
+    mended: list[InputsMended] = []
+    add = driver.node.robot.filter.handle
+
+    def handle(message: AgentMessage, now_ns: int) -> Sequence[AgentMessage]:
+        if isinstance(message, InputsMended):
+            mended.append(message)
+        return add(message, now_ns)
+
+    driver.node.robot.filter.handle = handle  # type: ignore[method-assign]
+    for _ in range(2):
+        driver.run(20.0)
+        wrong_ns = driver.now_ns
+        driver.run(15.0, each_sighting(bearing_rad=math.degrees))
+        assert not mended
+        driver.run(10.0)
+        assert -SECOND < wrong_ns - mended.pop().since_ns <= SELDOM * SECOND
 
 
 def test_what_is_refused_never_moves_the_estimate() -> None:

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from msgspec.structs import replace
 from support.core import (
     LOOP_START,
     PROBABILISTIC,
@@ -46,9 +45,8 @@ from cpcbl_team.geometry import Pose2, step, wrap_angle
 from cpcbl_team.inputs import BeliefShared, Fix, Odometry, Sighting
 from cpcbl_team.localizer import Localizer
 from cpcbl_team.motion import motion_noise
-from cpcbl_team.sender_records import QuarantineReason
 from cpcbl_team.sensors import range_sigma_m
-from cpcbl_team.state import State, TeammateMemory
+from cpcbl_team.state import State
 
 ORIGIN = Pose2(0.0, 0.0, 0.0)
 STILL = OdometrySettings(moves=False)
@@ -374,16 +372,3 @@ def test_a_lost_robot_that_drives_relocalizes_at_the_first_fix(variant: Variant)
                 assert not headed or heading_error(state.estimate, truth) < 0.3
     assert found[True] == SECOND // 10
     assert found[False] >= 5 * SECOND // 10
-
-
-def test_a_quarantined_teammate_does_not_relocalize_the_robot() -> None:
-    robot = localizer("joint", Field(), start=UNKNOWN, odometry=STILL)
-    state = robot.start(0)
-    state = robot.add_fix(state, fix(1.0, 2.0, 1, heading=0.5))
-    voice = replace(state.memory.teammates.senders["mate"], reason=QuarantineReason.BIASED)
-    lost = robot.start(0).memory._replace(teammates=TeammateMemory(senders={"mate": voice}))
-    state = robot.start(0)._replace(memory=lost)
-    for i in range(1, 5):
-        state = robot.add_fix(state, fix(1.0, 2.0, i * SECOND, heading=0.5))
-    assert state.lost != ""
-    assert state.memory.recovery.evidence == ()

@@ -4,6 +4,7 @@ import math
 
 import pytest
 from msgspec.structs import replace
+from support.core import SECOND
 
 from cpcbl_team.config import Field, LocalizationSettings, Start
 from cpcbl_team.inputs import InputsMended
@@ -36,3 +37,17 @@ def test_the_heading_turns_the_covariance_grows_and_teammates_are_forgiven() -> 
     assert records["north"].reason is None
     assert records["west"].reason is QuarantineReason.JUMPS  # odometry contradicts it
     assert all(record.score == 0.0 for record in records.values())
+
+
+def test_a_quarantine_from_before_the_inputs_were_wrong_goes_on() -> None:
+    """The inputs were wrong from the tenth second; a liar was found in the ninth."""
+    localizer = Localizer(LocalizationSettings(), Field())
+    state = localizer.start(0)
+    biased = SenderRecord(reason=QuarantineReason.BIASED, since_ns=9 * SECOND, quarantines=1)
+    senders = {"liar": biased, "correct": replace(biased, since_ns=12 * SECOND)}
+    state = with_teammates(state, with_senders(state.memory.teammates, senders))
+    for since_ns, is_liar_released in ((10 * SECOND, False), (0, True)):
+        event = InputsMended(17 * SECOND, since_ns=since_ns)
+        records = localizer.forget_wrong_inputs(state, event).memory.teammates.senders
+        assert records["correct"].reason is None
+        assert (records["liar"].reason is None) is is_liar_released

@@ -158,6 +158,7 @@ class InputMonitor:
         self._hysteresis, self._implausible = ProblemHysteresis(), tuple[str, ...]()
         self.are_mended = self._are_wrong = False
         """Whether inputs were wrong before the last judgement, and are right."""
+        self.wrong_since_ns = start_ns  # when it last looked and found nothing, before they were
         self.has_moved = self.is_mistake_contradicted = False
         """Whether odometry, or a pose that was found elsewhere, said so at a judgement."""
         wheels = settings.odometry
@@ -221,12 +222,14 @@ class InputMonitor:
         self._judgements += any(self.inputs[name].messages for name in shown)
         is_early = self._judgements < OFTEN
         is_due = bool(self._hysteresis or snapshot.lost or self._confirmation.is_awaited)
-        if is_due or is_early or self._judgements % SELDOM == 0:
+        if has_looked := is_due or is_early or self._judgements % SELDOM == 0:
             facts = self._with_latest(snapshot, facts, before.now_ns)
             self._implausible = self._find_implausible(snapshot, facts, bool(problems), now_ns)
         are_refused = any(map(is_often_refused, facts.windows.values()))
         are_wrong = bool(self._implausible or snapshot.mistake) or are_refused
         self.are_mended, self._are_wrong = self._are_wrong and not are_wrong, are_wrong
+        if has_looked and not (are_wrong or self.are_mended or self._hysteresis):
+            self.wrong_since_ns = now_ns
         health = tuple(self._health(name, totals, before) for name in shown)
         said = (*problems, *self._implausible)
         jumps = self._jumps.judge(snapshot.jump, self.inputs["odometry"].steps, now_ns)
