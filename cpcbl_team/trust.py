@@ -361,12 +361,14 @@ def reset_scores(senders: SenderRecords) -> SenderRecords:
 
 def forgive(senders: SenderRecords, now_ns: int, since_ns: int = 0) -> SenderRecords:
     """The records after the robot found an error of its own, which it has had since then: what
-    disagreed with its estimate may have been right. An older quarantine has another cause."""
+    disagreed with its estimate may have been right. An older quarantine has another cause, unless
+    nobody else is left: then the error began before it was found."""
+    blamed = {n: r for n, r in senders.items() if r.reason in _BY_COMPARISON}
+    caused = {n for n, r in blamed.items() if r.since_ns >= since_ns}
+    if all(r.reason and n not in caused for n, r in senders.items()):
+        caused = set(blamed)
     return {
-        n: released(r, now_ns)
-        if r.reason in _BY_COMPARISON and r.since_ns >= since_ns
-        else replace(r, score=0.0)
-        for n, r in senders.items()
+        n: released(r, now_ns) if n in caused else replace(r, score=0.0) for n, r in senders.items()
     }
 
 

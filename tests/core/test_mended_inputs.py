@@ -12,6 +12,7 @@ from cpcbl_team.localizer import Localizer
 from cpcbl_team.sender_records import QuarantineReason, SenderRecord
 from cpcbl_team.state import with_senders, with_teammates
 from cpcbl_team.timeline import Timeline
+from cpcbl_team.trust import forgive
 
 
 def test_the_heading_turns_the_covariance_grows_and_teammates_are_forgiven() -> None:
@@ -51,3 +52,16 @@ def test_a_quarantine_from_before_the_inputs_were_wrong_goes_on() -> None:
         records = localizer.forget_wrong_inputs(state, event).memory.teammates.senders
         assert records["correct"].reason is None
         assert (records["liar"].reason is None) is is_liar_released
+
+
+def test_where_nobody_else_is_left_older_quarantines_end_too() -> None:
+    biased = SenderRecord(reason=QuarantineReason.BIASED, since_ns=9 * SECOND, quarantines=1)
+    jumping = replace(biased, reason=QuarantineReason.JUMPS)
+    for others, is_released in (
+        ({"west": jumping}, True),
+        ({"west": SenderRecord()}, False),
+        ({"west": replace(biased, since_ns=12 * SECOND)}, False),
+    ):
+        records = forgive({"north": biased, **others}, 17 * SECOND, 10 * SECOND)
+        assert (records["north"].reason is None) is is_released
+    assert forgive({}, 17 * SECOND, 10 * SECOND) == {}
