@@ -12,7 +12,7 @@ from cpcbl_team.augmented_update import (
     updated_by_landmark_belief,
     updated_by_teammate,
 )
-from cpcbl_team.common_errors import CommonErrors
+from cpcbl_team.common_errors import CommonErrors, inflated
 from cpcbl_team.config import CameraSettings, Field, LocalizationSettings
 from cpcbl_team.estimate import Estimate, Row
 from cpcbl_team.fusion import Observation
@@ -24,8 +24,8 @@ from cpcbl_team.map_rejections import MapRejections
 from cpcbl_team.measurements import GatedObject, Measurement, observation_of
 from cpcbl_team.miscalibration import noise_with_factor
 from cpcbl_team.moved_landmarks import (
+    INFLATION,
     biased_landmark,
-    inflated,
     with_found_anew,
     with_innovations,
     with_move,
@@ -246,7 +246,7 @@ class CommonErrorFilter:
         if not is_rejected:
             name = biased_landmark(sums, now_ns)
             if name:
-                estimate, common = inflated(estimate, common)
+                estimate, common = inflated(estimate, common, INFLATION)
         if not name or name not in common.objects:
             memory = memory._replace(common=common, innovations=sums)
             return with_calibration(state, memory), estimate

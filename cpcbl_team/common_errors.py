@@ -19,7 +19,7 @@ from cpcbl_team.camera_errors import (
     range_sensitivity,
     without_errors,
 )
-from cpcbl_team.estimate import Estimate, Row, dot
+from cpcbl_team.estimate import ZERO3, Estimate, Row, dot
 from cpcbl_team.gaussian import Covariance2, Gaussian2
 from cpcbl_team.inputs import Sighting
 from cpcbl_team.motion import motion_jacobian
@@ -217,3 +217,13 @@ class CommonErrors(NamedTuple):
         of_x = (0, dy), (1, -along * dx + across * dy)
         of_y = (0, -dx), (1, -along * dy - across * dx)
         return of_x, of_y
+
+
+def inflated(
+    estimate: Estimate, common: CommonErrors, factor: float
+) -> tuple[Estimate, CommonErrors]:
+    """Both with their joint covariance times this factor."""
+    pose, covariance, shared = estimate
+    shared = shared if shared is ZERO3 else shared.scaled(factor)
+    wider = Estimate(pose, covariance.scaled(factor), shared)
+    return wider, common._replace(parameters=common.parameters.inflated(factor))

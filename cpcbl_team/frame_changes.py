@@ -10,9 +10,9 @@ bounds them together whatever it is: the covariances of each count twice.
 import math
 from itertools import product
 
-from cpcbl_team.common_errors import CommonErrors
+from cpcbl_team.common_errors import CommonErrors, inflated
 from cpcbl_team.config import Field, Start
-from cpcbl_team.estimate import ZERO3, Estimate, Row, dot
+from cpcbl_team.estimate import Estimate, Row, dot
 from cpcbl_team.inputs import FrameChange
 from cpcbl_team.map_rejections import MapRejections
 from cpcbl_team.parameters import Numbers
@@ -83,10 +83,7 @@ def after_frame_change(state: State, change: FrameChange) -> State:
     new = [i for i, n in enumerate(change.landmarks) if common and n not in common.objects]
     if common is None or not new:
         return state
-    (pose, covariance, shared), parameters = state.estimate, common.parameters
-    shared = shared if shared is ZERO3 else shared.scaled(INFLATION)
-    wider = Estimate(pose, covariance.scaled(INFLATION), shared)
-    common = common._replace(parameters=parameters.inflated(INFLATION))
+    wider, common = inflated(state.estimate, common, INFLATION)
     common = _with_places(common, wider, change, new)
     return with_common_errors(state._replace(estimate=wider), common)
 

@@ -10,8 +10,6 @@ import math
 from collections.abc import Iterable, Mapping
 from typing import Final
 
-import msgspec
-
 from cpcbl_team.config import RobotSettings, Start, Team
 from cpcbl_team.sensors import range_sigma_m
 
@@ -51,7 +49,7 @@ def frame_text(frame: str) -> str:
 def knows_map(team: Team, robot: str) -> bool:
     """Whether this robot can find its pose on the field by itself, without its start."""
     field, settings = team.map_of(robot), team.robots[robot]
-    return bool(field.landmarks or field.walls) or settings.position_sensor is not None
+    return field.has_surveyed or settings.position_sensor is not None
 
 
 def knows_field(team: Team, robot: str) -> bool:
@@ -107,9 +105,3 @@ def _quality(settings: RobotSettings) -> int:
     octaves = math.log2(max(mapping_sigma_m(settings), 1e-6))
     blind = 0 if settings.sensor.sees_landmarks else 1000
     return blind + round(STEPS_PER_OCTAVE * octaves)
-
-
-def with_own_frame(team: Team, robot: str) -> Team:
-    """The team as a robot has it that begins a frame of its own."""
-    own = msgspec.structs.replace(team.robots[robot], start=ORIGIN)
-    return msgspec.structs.replace(team, robots={**team.robots, robot: own})

@@ -87,7 +87,7 @@ class Localizer:
         self.settings, self.field, rules = settings, field, settings.localizer
         gates = chi_square_bounds(rules.gate_probability)
         self._rules, self._gates = rules, gates
-        self._has_map = bool(field.landmarks or field.walls)
+        self._has_map = field.has_surveyed
         self._minimum_interval_ns = rules.minimum_interval_s * 1e9
         self._widens = rules.variant != "weighted" and not rules.paper_uncertainty
         self._window = rules.lost_window

@@ -122,13 +122,6 @@ def biased_landmark(sums: Innovations, stamp_ns: int) -> str:
     return name if most > max(LEAST_BIAS, LEAST_RATIO * second) else ""
 
 
-def inflated(estimate: Estimate, common: CommonErrors) -> tuple[Estimate, CommonErrors]:
-    """Less certain, for a landmark that moved has led all of it along."""
-    pose, covariance, shared = estimate
-    wider = Estimate(pose, covariance.scaled(INFLATION), shared.scaled(INFLATION))
-    return wider, common._replace(parameters=common.parameters.inflated(INFLATION))
-
-
 def with_move(moves: Moves, name: str, common: CommonErrors, stamp_ns: int) -> Moves:
     """With the place at which a landmark stood until now. One that moves again soon has moved from
     where it was before."""

@@ -183,4 +183,6 @@ def _newest(
     tokens.pop(key, None)
     if alive:
         tokens[key] = value
+    if not tokens:
+        del by_robot[robot]  # guests come under ever new names
     return next(reversed(tokens.values()), None)

@@ -110,6 +110,11 @@ class Field(Table, frozen=True, kw_only=True):
         return {**self.walls, **self.unsurveyed_walls}
 
     @property
+    def has_surveyed(self) -> bool:
+        """Whether the place of any landmark or wall is known beforehand."""
+        return bool(self.landmarks or self.walls)
+
+    @property
     def gives_only_ranges(self) -> bool:
         """Whether there is something on the map, and no bearing of it is used."""
         gives = {mark.gives for mark in self.landmarks.values()}
@@ -141,7 +146,7 @@ class Field(Table, frozen=True, kw_only=True):
 
     def distance(self, x_m: float, y_m: float) -> float:
         """How far a point is outside of the bounds; zero inside, and where the map is empty."""
-        if not (self.landmarks or self.walls):
+        if not self.has_surveyed:
             return 0.0
         x0, y0, x1, y1 = self.bounds()
         return math.hypot(max(x0 - x_m, 0.0, x_m - x1), max(y0 - y_m, 0.0, y_m - y1))

@@ -32,6 +32,17 @@ def test_a_teammate_is_there_until_its_token_goes() -> None:
     assert tokens.update(alive(7), False) == Presence("mate", None)
 
 
+def test_nothing_is_kept_of_those_that_are_gone() -> None:
+    tokens, empty = LivelinessTokens(), vars(LivelinessTokens())
+    for name in ("guest1", "guest2"):
+        own = {"robot": name, "incarnation": 1}
+        for key in (topics.ALIVE.at(tier=7, **own), topics.FRAME.at(frame="field", **own)):
+            tokens.update(key, True)
+            assert vars(tokens) != empty
+            tokens.update(key, False)
+    assert vars(tokens) == empty
+
+
 def test_of_two_tokens_the_newest_counts() -> None:
     """At a change of tier the new one comes before the old one goes."""
     tokens = LivelinessTokens()

@@ -143,7 +143,9 @@ def decode_help(key: str, payload: bytes) -> Help | Refusal:
 
 
 _is_name = re.compile(NAME_PATTERN).fullmatch
-_is_tier = re.compile(r"[A-Za-z0-9_.-]{1,32}(~[A-Za-z0-9_.-]{1,64})?").fullmatch
+_is_tier = re.compile(
+    rf"[A-Za-z0-9_.-]{{1,32}}({topics.IN_FRAME_MARK}[A-Za-z0-9_.-]{{1,64}})?"
+).fullmatch
 
 
 @lru_cache(maxsize=4096)

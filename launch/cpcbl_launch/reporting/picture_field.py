@@ -69,7 +69,7 @@ def visible_box(team: Team, paths: Sequence[RobotPath]) -> Box:
     lost may be anywhere: they widen it only so far."""
     least_x, least_y, most_x, most_y = team.map.bounds()
     points = [np.empty((0, 2))]
-    if team.map.landmarks or team.map.walls:
+    if team.map.has_surveyed:
         points.append(np.array([(least_x, least_y), (most_x, most_y)]))
     for path in paths:
         points += [path.truth[:, 1:], _almost_all(path.pose[~path.is_lost, :2])]

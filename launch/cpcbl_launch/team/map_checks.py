@@ -49,7 +49,7 @@ def map_problems(team: Team) -> Iterator[str]:
 def _frame_problems(team: Team) -> Iterator[str]:
     if team.map.frame != "agreed":
         return
-    if team.map.landmarks or team.map.walls:
+    if team.map.has_surveyed:
         yield (
             "map.frame: agreed is for a team without a map, and every robot knows the landmarks and"
             " walls of this one; remove the key"

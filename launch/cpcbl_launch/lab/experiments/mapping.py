@@ -125,7 +125,7 @@ def row(key: tuple[str, str, str], runs: list[list[MappingRun]]) -> dict[str, ob
     robots, seeing, gives = key
     figures: dict[str, object] = {"robots": len(robots), "seeing": len(seeing), "gives": gives}
     means = np.array([np.nanmean([r.figures[:5] for r in run], axis=0) for run in runs])
-    squares, nees, heading, inside, lost = means.T
+    _, nees, heading, inside, lost = means.T
     squares = [np.nanmean([r.figures.rmse_m**2 for r in run]) for run in runs]
     known = [np.nanmean([r.surveyed_rmse_m**2 for r in run]) for run in runs]
     places = [np.nanmean([r.place_nees for r in run]) for run in runs]

@@ -31,6 +31,7 @@ from cpcbl_launch.simulation.field_node import FieldNode
 from cpcbl_launch.simulation.in_process import robot_nodes, run_nodes
 from cpcbl_launch.simulation.robot import VisibleObject
 from cpcbl_team.config import Field, Gives, Landmark, SimulationEvent, Team
+from cpcbl_team.fusion import chi_square_bounds
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus
 from cpcbl_transport.decoding import decode
@@ -41,7 +42,7 @@ ROBOT, LANDMARKS = "a", 8
 WRONG_S, LENGTH_S = 30.0, 90.0
 FIRST_S = 3.0  # of a run: nothing can be said before
 HIDDEN_S, NARROW_DEG = 6.0, 70.0
-BOUND = 13.82  # of 99.9 %, with two degrees of freedom
+_, BOUND = chi_square_bounds(0.999)  # with two degrees of freedom
 FEET_M = 0.3048
 BOX = "m4"
 """The landmark with which something is wrong, in the middle of a long side."""
