@@ -170,9 +170,12 @@ def _robot_specs(
     clock: Clock,
     checkout: Path | None,
     robots: Sequence[str],
+    record: str = "",
 ) -> list[ProcessSpec]:
-    """The processes of these robots, with the code of another checkout if one is given."""
-    specs = process_table(team, folder / "team.json", endpoint, clock, seed=1, here=robots)
+    """The processes of these robots, with the code of another checkout if one is given. `record`:
+    the folder that they record into, if they do."""
+    file = folder / "team.json"
+    specs = process_table(team, file, endpoint, clock, seed=1, here=robots, record=record)
     robot_specs = [spec for spec in specs if spec.name.startswith("robot-")]
     if checkout is None:
         return robot_specs
@@ -190,8 +193,11 @@ def _robot_specs(
 # Running ------------------------------------------------------------------------------------------
 
 
-def measure_team(robots: int, seconds: float, checkout: Path | None = None) -> Load:
-    """A team as `up` runs it; its robots with the code of another checkout if one is given."""
+def measure_team(
+    robots: int, seconds: float, checkout: Path | None = None, record: bool = False
+) -> Load:
+    """A team as `up` runs it; its robots with the code of another checkout if one is given, and
+    each with a recording of what it takes if `record` is set. Raises OSError where none is."""
     team, endpoint, lead_s = swarm_team(robots, 1), free_endpoint(), _lead_s(robots)
     clock, names = Clock.starting_in(lead_s), list(team.robots)
     with _routed(team, endpoint) as (folder, bus), ExitStack() as stack:
@@ -200,12 +206,21 @@ def measure_team(robots: int, seconds: float, checkout: Path | None = None) -> L
             bus.subscribe(topic.at(), counts.receive)
         bus.subscribe(topics.IN_ODOMETRY.at(robot=names[0]), counts.receive)
         specs = process_table(team, folder / "team.json", endpoint, clock, seed=1, here=())
-        specs += _robot_specs(team, folder, endpoint, clock, checkout, names)
+        recordings = str(folder / "recordings") if record else ""
+        specs += _robot_specs(team, folder, endpoint, clock, checkout, names, recordings)
         supervisor = stack.enter_context(Supervisor(specs, folder))
         counts.wait_for(names, lead_s + PATIENCE_S)
         pids = {name.removeprefix("robot-"): pid for name, pid in supervisor.pids.items()}
         odometry_hz = team.robots[names[0]].odometry.rate_hz
-        return _load(names, pids, TRACKS_HZ, odometry_hz, counts, seconds)
+        load = _load(names, pids, TRACKS_HZ, odometry_hz, counts, seconds)
+        if record and (silent := set(names) - _recorded(folder / "recordings")):
+            raise OSError(f"{', '.join(sorted(silent))}: nothing was recorded")
+        return load
+
+
+def _recorded(folder: Path) -> set[str]:
+    """The robots with a recording that is not empty."""
+    return {file.parent.name for file in folder.glob("*/*.cpcbl") if file.stat().st_size > 0}
 
 
 def measure_broadcast(robots: int, seconds: float) -> Load:

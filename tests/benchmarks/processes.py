@@ -3,8 +3,9 @@
 Each size of a team runs as `up` runs it: one process per robot, one for the simulated field, and a
 router in this process, in real time. For comparison, as many bare processes put a belief at the
 rate at which robots do, and receive and decode those of all others ("broadcast"); they localize
-nothing. `--old` measures the robots of another checkout in the same run, with the present field and
-router. A size is kept if the worst of its robots keeps `KEPT` of its ticks.
+nothing. `--record` measures the same robots once more while each records itself, and `--old` the
+robots of another checkout in the same run, with the present field and router. A size is kept if the
+worst of its robots keeps `KEPT` of its ticks.
 
 `make bench-processes ARGS='--team-sizes 24,32,40 --duration 8 --old ../earlier-checkout'`
 """
@@ -36,10 +37,12 @@ STARTS = 5
 
 
 class Size(msgspec.Struct, frozen=True, kw_only=True):
-    """One size of a team: the robots, those of the old checkout, and the broadcast."""
+    """One size of a team: the robots, the same with recordings, those of the old checkout, and the
+    broadcast."""
 
     robots: int
     team: Load
+    recorded: Load | None
     old: Load | None
     broadcast: Load
 
@@ -73,7 +76,11 @@ def parse_sizes(text: str) -> list[int]:
 
 
 def measure(
-    sizes: Sequence[int], seconds: float, old: Path | None = None, starts: int = STARTS
+    sizes: Sequence[int],
+    seconds: float,
+    old: Path | None = None,
+    starts: int = STARTS,
+    record: bool = False,
 ) -> Processes:
     """Measures the sizes in this order until the present robots do not keep 10 Hz."""
     load_average = os.getloadavg()[0]
@@ -84,6 +91,7 @@ def measure(
         size = Size(
             robots=robots,
             team=measure_team(robots, seconds),
+            recorded=measure_team(robots, seconds, record=True) if record else None,
             old=None if old is None else measure_team(robots, seconds, old),
             broadcast=measure_broadcast(robots, seconds),
         )
@@ -112,7 +120,8 @@ def tables(result: Processes) -> Iterable[RenderableType]:
         ("kept %", "field", "CPU %", "field", "router", "RSS", "PSS", "in /s", "in B/s"),
     )
     for size in result.sizes:
-        for kind, load in (("team", size.team), ("old", size.old), ("broadcast", size.broadcast)):
+        loads = size.team, size.recorded, size.old, size.broadcast
+        for kind, load in zip(("team", "recorded", "old", "broadcast"), loads, strict=True):
             if load is None:
                 continue
             shares = (load.kept, load.field_kept, load.cpu, load.cpu_field, load.cpu_router)
@@ -145,6 +154,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="bench-processes", description=main.__doc__)
     parser.add_argument("--team-sizes", default="4,8,16,24,32,48,64", help="Sizes of the team.")
     parser.add_argument("--duration", type=float, default=15.0, help="Seconds for each size.")
+    parser.add_argument("--record", action="store_true", help="Measure recorded robots, too.")
     parser.add_argument("--old", type=Path, help="Another checkout, measured in the same run.")
     parser.add_argument("--output", type=Path, default=Path("build"), help="Folder for the JSON.")
     given = parser.parse_args()
@@ -153,7 +163,7 @@ def main() -> None:
         sizes = parse_sizes(given.team_sizes)
     except InputError as error:
         parser.error(str(error))
-    result = measure(sizes, given.duration, given.old)
+    result = measure(sizes, given.duration, given.old, record=given.record)
     show_and_write(result, tables(result), given.output / "processes.json")
 
 

@@ -25,13 +25,14 @@ def test_a_team_and_a_broadcast_of_the_same_size_are_measured(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(process_load, "WARM_S", 1.0)
-    result = processes.measure([2], 3.0, starts=1)
+    result = processes.measure([2], 3.0, starts=1, record=True)
     assert 0.0 < result.start.median_s == result.start.slowest_s
     assert result.start.resident_mib > 10.0
     (size,) = result.sizes
     assert size.robots == 2
     assert result.most_kept in (0, 2)
-    for load in (size.team, size.broadcast):
+    assert size.recorded is not None
+    for load in (size.team, size.recorded, size.broadcast):
         assert 0.0 <= load.kept <= load.kept_mean <= 1.0
         assert load.kept_mean > 0.0
         assert 0.0 <= load.cpu < 2.0  # two that only read may take less than a tick of the clock
@@ -43,7 +44,7 @@ def test_a_team_and_a_broadcast_of_the_same_size_are_measured(
     assert size.broadcast.received_hz > 0.0
     received = size.broadcast.received_bytes_s / BELIEF_BYTES
     assert received == pytest.approx(size.broadcast.received_hz, rel=0.1)
-    assert_fits(processes.tables(result), "broadcast", "10 Hz")
+    assert_fits(processes.tables(result), "recorded", "broadcast", "10 Hz")
 
 
 def test_sizes_grow_until_one_does_not_keep_10_hz(
