@@ -60,7 +60,7 @@ def knows_field(team: Team, robot: str) -> bool:
 
 def begins_frame(team: Team, robot: str) -> bool:
     """Whether this robot begins a frame of its own at its start."""
-    return team.map.frame == "agreed" and not knows_field(team, robot)
+    return team.map.is_frame_agreed and not knows_field(team, robot)
 
 
 def mapping_sigma_m(settings: RobotSettings) -> float:

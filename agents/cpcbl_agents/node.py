@@ -114,7 +114,7 @@ class Node:
         self.arrivals, self._load = tape.arrivals(*named, callbacks.on_arrival), LoadMonitor(speed)
         robot.sensing.wrap(tape)
         put_message, put_token = self.arrivals.put_message, self.arrivals.put_token
-        is_agreed = team.map.frame == "agreed"
+        is_agreed = team.map.is_frame_agreed
         self._declarations = Declarations(
             robot.name, incarnation, rules, bus, put_message, put_token, is_agreed
         )

@@ -237,7 +237,7 @@ class Robot:
 
 def robot_frames(name: str, team: Team, start_ns: int) -> RobotFrames | None:
     """The frames of this robot; None in a team whose frame is that of the map."""
-    if team.map.frame != "agreed":
+    if not team.map.is_frame_agreed:
         return None
     frame = frame_name(name, start_ns) if begins_frame(team, name) else FIELD
     order = FrameOrder(team.robots)

@@ -95,6 +95,11 @@ class Field(Table, frozen=True, kw_only=True):
     robots that meet join the better one."""
 
     @property
+    def is_frame_agreed(self) -> bool:
+        """Whether the robots agree on a frame, for there is none of the map."""
+        return self.frame == "agreed"
+
+    @property
     def names(self) -> frozenset[str]:
         """The names of all that robots may see, but for robots."""
         return frozenset((*self.landmarks, *self.unsurveyed, *self.all_walls))

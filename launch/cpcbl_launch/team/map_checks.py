@@ -47,7 +47,7 @@ def map_problems(team: Team) -> Iterator[str]:
 
 
 def _frame_problems(team: Team) -> Iterator[str]:
-    if team.map.frame != "agreed":
+    if not team.map.is_frame_agreed:
         return
     if team.map.has_surveyed:
         yield (
@@ -82,7 +82,7 @@ def map_warnings(team: Team) -> Iterator[str]:
                 f"map.landmarks.{name}.sigma_m: {mark.sigma_m:g} m is a large part of a map of"
                 f" {size_m:.1f} m; if it is in millimetres, write {1e-3 * mark.sigma_m:g}"
             )
-    is_agreed = team.map.frame == "agreed"
+    is_agreed = team.map.is_frame_agreed
     links = team.map.unsurveyed or any(r.sensor.sees_robots for r in team.robots.values())
     if is_agreed and not links:
         yield (
