@@ -27,6 +27,18 @@ LEAST_RECALL = {
 }
 
 
+LEAST_STANDARD_RECALL = {"clean": 0.6, "low light": 0.4, "occlusion": 0.5, "noise": 0.5}
+
+
+@pytest.mark.parametrize("kind", LEAST_STANDARD_RECALL)
+def test_standard_tags_are_recalled_and_none_is_wrong(kind: str) -> None:
+    backgrounds = textures(4, np.random.default_rng(3))
+    score = measured(kind, FRAMES, "apriltag_standard41h12", backgrounds, seed=2)
+    assert score.wrong == 0
+    assert score.recall >= LEAST_STANDARD_RECALL[kind]
+    assert max(max(errors, default=0.0) for errors in score.errors.values()) < 3.0
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_markers_of_a_bad_camera_are_recalled_and_none_is_wrong(kind: str) -> None:
     backgrounds = textures(4, np.random.default_rng(3))

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 
 from cpcbl_agents.vision.camera import Pixels
-from cpcbl_agents.vision.marker_codes import marker_dictionary
+from cpcbl_agents.vision.marker_families import opencv_dictionary
 
 
 def tiles(side_px: int) -> Pixels:
@@ -16,7 +16,7 @@ def tiles(side_px: int) -> Pixels:
 
 def turned_marker(number: int, degrees: float, at: tuple[float, float], scale: float) -> Pixels:
     """A marker of a robot that fell over."""
-    pattern = cv2.aruco.generateImageMarker(marker_dictionary("aruco_4x4_50"), number, 60)
+    pattern = cv2.aruco.generateImageMarker(opencv_dictionary("aruco_4x4_50"), number, 60)
     paper = cv2.copyMakeBorder(pattern, 12, 12, 12, 12, cv2.BORDER_CONSTANT, value=255)
     turn = cv2.getRotationMatrix2D((42.0, 42.0), degrees, scale)
     turn[:, 2] += np.array(at)

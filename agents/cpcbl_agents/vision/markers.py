@@ -137,8 +137,10 @@ class MarkerDetector:
     def _detect_markers(self, grey: Pixels, until_s: float = math.inf) -> list[DetectedMarker]:
         """All markers of the family in a picture, those with the most exact outlines first. Which
         quads are markers is read between corners that are nearly exact."""
+        if self._codes.layout.is_bright:
+            grey = cv2.bitwise_not(grey).astype(np.uint8, copy=False)
         quads, dropped = dark_quads(grey)
-        quads = _framed_quads(grey, quads, self._codes.cells)
+        quads = _framed_quads(grey, quads, self._codes.layout.quad)
         found: list[tuple[float, DetectedMarker]] = []
         for first in range(0, len(quads), BATCH):
             if first and time.thread_time() > until_s:
@@ -152,7 +154,7 @@ class MarkerDetector:
         """The markers among some quads (m, 4, 2), and by how much (px) the last pass moved their
         corners."""
         for _ in range(PASSES):
-            better = line_intersections(side_edge_points(grey, quads, self._codes.cells))
+            better = line_intersections(side_edge_points(grey, quads, self._codes.layout.quad))
             near = np.abs(better - quads).max(axis=(1, 2), initial=0.0) < FAR_PX
             quads = better[near]
             quads = quads[_shortest_sides(quads) > LEAST_SIDE_PX]
@@ -160,7 +162,7 @@ class MarkerDetector:
         if not codes:
             return []
         rough = quads[list(codes)]
-        sides = side_edge_points(grey, rough, self._codes.cells)
+        sides = side_edge_points(grey, rough, self._codes.layout.quad)
         exact = line_intersections(sides)
         undistorted = self._camera.undistort(sides.reshape(-1, 2)).reshape(sides.shape)
         planes = line_intersections(undistorted)

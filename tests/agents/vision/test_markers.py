@@ -27,6 +27,7 @@ FAMILIES: list[MarkerFamily] = [
     "apriltag_16h5",
     "apriltag_25h9",
     "apriltag_36h11",
+    "apriltag_standard41h12",
 ]
 
 
