@@ -7,10 +7,17 @@ from cpcbl_agents.vision.camera import Pixels
 from cpcbl_agents.vision.marker_families import opencv_dictionary
 
 
-def tiles(side_px: int) -> Pixels:
+def checkerboard(side_px: int) -> Pixels:
     """A floor of black and white squares."""
     y, x = np.mgrid[0:480, 0:640]
     grey = ((x // side_px + y // side_px) % 2 * 200 + 20).astype(np.uint8)
+    return np.repeat(grey[..., None], 3, axis=2)
+
+
+def tiles(side_px: int) -> Pixels:
+    """A floor of black squares with white joints."""
+    y, x = (at % (side_px + 4) < side_px for at in np.mgrid[0:480, 0:640])
+    grey = np.where(x & y, 20, 220).astype(np.uint8)
     return np.repeat(grey[..., None], 3, axis=2)
 
 

@@ -24,7 +24,7 @@ SHARPENING = 0.25
 MOST_CHANCE, MOST_CHANCE_SPOILT = 2e-4, 3e-5
 """That random bits are taken for a marker of the family: so many wrong bits are corrected. The
 second if a part of the border or the margin is covered, which is less evidence for a marker."""
-MOST_CORRECTED = 0.5  # share of the bits that a family could set right
+MOST_CORRECTED = 0.6  # share of the bits that a family could set right
 CLEAR_BITS = (
     0.45  # mean distance of the bits from the threshold; 1: as black or as white as the rings
 )
@@ -84,7 +84,7 @@ class MarkerReader:
         spoilt_border = (levels > middle)[:, self._border].mean(axis=1)
         spoilt_margin = (levels < middle)[:, self._margin].mean(axis=1)
         framed = (spoilt_border <= BORDER_SPOILT) & (spoilt_margin <= MARGIN_SPOILT)
-        framed &= 2.0 * half.min(axis=(1, 2)) > LEAST_CONTRAST
+        framed &= 2.0 * half[:, ~self._margin].min(axis=1) > LEAST_CONTRAST
         framed &= self._scatter(levels, white, black, middle) < MOST_SCATTER
         whole = (spoilt_border == 0.0) & (spoilt_margin == 0.0)
         (at,) = framed.nonzero()

@@ -273,10 +273,11 @@ def _framed_quads(grey: Pixels, quads: Floats, cells: int) -> Floats:
     more, those of the largest difference first."""
     if not len(quads):
         return quads
+    middles = quads.mean(axis=1)[:, None, None]
     ways = quads[:, _NEXT] - quads
-    outwards = 0.5 / cells * ways[..., ::-1] * _OUTWARDS
-    places = quads[:, :, None] + _PROBES[:, None] * ways[:, :, None]
-    pairs = np.stack([places - outwards[:, :, None], places + outwards[:, :, None]], axis=3)
+    places = quads[:, :, None] + _PROBES[:, None] * ways[:, :, None] - middles
+    half_cell = places / cells  # also where the marker is seen from the side
+    pairs = np.stack([places - half_cell, places + half_cell], axis=3) + middles[:, :, None]
     levels = sample_grey(grey, pairs.reshape(len(quads), -1, 2)).reshape(pairs.shape[:-1])
     steps = levels[..., 1] - levels[..., 0]
     third = np.sort(np.median(steps, axis=2), axis=1)[:, 1]
