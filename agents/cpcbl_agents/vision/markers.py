@@ -127,16 +127,16 @@ class MarkerDetector:
         if not self._mounts:
             return Detections()
         grey = cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY).astype(np.uint8, copy=False)
-        markers = self._detect_markers(grey, until_s)
+        markers = self.detect_markers(grey, until_s)
         own, ambiguities = assign_markers(markers, self._mounts, self._robot)
         found = Detections((), ambiguities)
         for name, sides in own.items():
             found |= self._locate(name, sides)
         return found
 
-    def _detect_markers(self, grey: Pixels, until_s: float = math.inf) -> list[DetectedMarker]:
-        """All markers of the family in a picture, those with the most exact outlines first. Which
-        quads are markers is read between corners that are nearly exact."""
+    def detect_markers(self, grey: Pixels, until_s: float = math.inf) -> list[DetectedMarker]:
+        """All markers of the family in a grey picture, those with the most exact outlines first.
+        Which quads are markers is read between corners that are nearly exact."""
         if self._codes.layout.is_bright:
             grey = cv2.bitwise_not(grey).astype(np.uint8, copy=False)
         quads, dropped = dark_quads(grey)
