@@ -14,6 +14,7 @@ MarkerFamily = Literal[
     "apriltag_16h5",
     "apriltag_25h9",
     "apriltag_36h11",
+    "apriltag_standard41h12",
 ]
 MARKERS: dict[MarkerFamily, int] = {
     "aruco_4x4_50": 50,
@@ -22,9 +23,13 @@ MARKERS: dict[MarkerFamily, int] = {
     "apriltag_16h5": 30,
     "apriltag_25h9": 35,
     "apriltag_36h11": 587,
+    "apriltag_standard41h12": 2115,
 }
 """The number of markers in a family: 0, 1, ..."""
-LIKE_MIRRORED: dict[MarkerFamily, frozenset[int]] = {"aruco_4x4_50": frozenset({8, 9, 17, 47})}
+LIKE_MIRRORED: dict[MarkerFamily, frozenset[int]] = {
+    "aruco_4x4_50": frozenset({8, 9, 17, 47}),
+    "apriltag_standard41h12": frozenset({1597}),
+}
 """Markers that equal their own mirror image, so that a marker seen in a mirror looks like them."""
 
 
@@ -118,7 +123,8 @@ class VisionSettings(Table, frozen=True, kw_only=True):
     """The shape of robots' colour bands, above their centre."""
     family: MarkerFamily = "aruco_4x4_50"
     marker_m: Positive = 0.12
-    """The side of a marker's black square."""
+    """The side of a marker's black square; of the white one in the black one of
+    `apriltag_standard41h12`, which is 5/9 of the whole marker."""
     marker_mounted_m: Positive = 0.12
     """The height of a marker's centre above the floor; markers stand upright."""
     marker_distance_m: Positive = 0.12

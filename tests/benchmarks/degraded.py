@@ -3,8 +3,9 @@ frames of a bad camera with natural pictures behind the markers (`degraded_frame
 
 For each kind of degradation it prints how many of the markers were recalled, wrong ids, the share
 of errors inside three stated sigmas and the worst of them, and the 99th percentile of the time of a
-frame as a multiple of OpenCV's. The peers are in the extra `bench`; a family that pupil-apriltags
-does not have is compared with OpenCV alone.
+frame as a multiple of OpenCV's. The peers are in the extra `bench`; a family that one of them does
+not have is compared with the other alone. `--photographs FOLDER` counts instead how many tags of
+photographs each of them reads (`photographs.py`).
 """
 
 import argparse
@@ -25,7 +26,10 @@ from benchmarks.degraded_frames import (
     Pixels,
     background,
     degraded_frame,
+    marker_ratio,
 )
+from benchmarks.photographs import tags_read
+from benchmarks.readers import Reader, own_reader, peers
 from rich.console import Console
 from rich.table import Table
 from support.cameras import calibrated
@@ -37,15 +41,8 @@ from cpcbl_team.inputs import Sighting
 
 SUBJECT = "r0"
 LEAST_PICTURE_PX = 240
+MARKER_M = 0.12  # the whole marker
 QUANTITIES = ("range", "bearing", "heading")
-PUPIL: dict[MarkerFamily, str] = {
-    "apriltag_16h5": "tag16h5",
-    "apriltag_25h9": "tag25h9",
-    "apriltag_36h11": "tag36h11",
-}
-
-# Numbers and middles (x, y; px) of the markers in a grey picture
-Reader = Callable[[Pixels], list[tuple[int, float, float]]]
 
 
 class Score(NamedTuple):
@@ -81,7 +78,7 @@ def marked_team(family: MarkerFamily) -> Team:
     return Team(
         name="degraded",
         robots={"me": RobotSettings(), **robots},
-        vision=VisionSettings(family=family),
+        vision=VisionSettings(family=family, marker_m=MARKER_M / marker_ratio(family)),
     )
 
 
@@ -171,34 +168,6 @@ def _errors(seen: Sighting, frame: Degraded) -> dict[str, float]:
     return errors
 
 
-def opencv_reader(family: MarkerFamily) -> Reader:
-    """OpenCV's detector with its parameters as they come."""
-    name = f"DICT_{family.removeprefix('aruco_').upper()}"
-    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
-    detector = cv2.aruco.ArucoDetector(dictionary)
-
-    def read(grey: Pixels) -> list[tuple[int, float, float]]:
-        corners, numbers, _ = detector.detectMarkers(grey)
-        middles = [c.reshape(4, 2).mean(axis=0) for c in corners]
-        found = [] if numbers is None else numbers.ravel().tolist()
-        return [(int(n), float(m[0]), float(m[1])) for n, m in zip(found, middles, strict=True)]
-
-    return read
-
-
-def pupil_reader(family: MarkerFamily) -> Reader:
-    """pupil-apriltags as it comes, but at full resolution."""
-    module = import_module("pupil_apriltags")
-    detector = module.Detector(families=PUPIL[family], nthreads=1, quad_decimate=1.0)
-
-    def read(grey: Pixels) -> list[tuple[int, float, float]]:
-        return [
-            (int(t.tag_id), float(t.center[0]), float(t.center[1])) for t in detector.detect(grey)
-        ]
-
-    return read
-
-
 def natural_pictures() -> list[Pixels]:
     """The pictures that are in the package scikit-image."""
     folder = Path(import_module("skimage").__file__ or "").parent / "data"
@@ -239,14 +208,18 @@ def main() -> None:
     parser.add_argument("--family", choices=get_args(MarkerFamily), default="apriltag_36h11")
     parser.add_argument("--kinds", default=",".join(KINDS), help="separated by commas")
     parser.add_argument("--crops", type=int, default=0, help="natural pictures without a marker")
+    parser.add_argument("--photographs", type=Path, help="read those of a folder instead")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--out", type=Path, default=Path("build/degraded.json"))
     chosen = parser.parse_args()
     cv2.setNumThreads(1)
-    peers = {"OpenCV": opencv_reader(chosen.family)}
-    if chosen.family in PUPIL:
-        peers["pupil"] = pupil_reader(chosen.family)
-    backgrounds, readers = natural_pictures(), list(peers.values())
+    others = peers(chosen.family)
+    if chosen.photographs:
+        due, read = tags_read(chosen.photographs, {"own": own_reader(chosen.family)} | others)
+        counts = ", ".join(f"{name} {count}" for name, count in read.items())
+        Console().print(f"{due} tags in photographs, read by: {counts}")
+        return
+    backgrounds, readers = natural_pictures(), list(others.values())
     scores = [
         measured(kind, chosen.frames, chosen.family, backgrounds, readers, chosen.seed)
         for kind in chosen.kinds.split(",")
@@ -254,7 +227,7 @@ def main() -> None:
     chosen.out.parent.mkdir(exist_ok=True)
     chosen.out.write_bytes(msgspec.json.format(msgspec.json.encode([s._asdict() for s in scores])))
     console = Console(width=160)
-    console.print(printed(scores, list(peers)))
+    console.print(printed(scores, list(others)))
     if chosen.crops:
         false = false_markers(chosen.family, backgrounds, chosen.crops, chosen.seed)
         console.print(f"{chosen.crops} natural pictures without a marker: {false} false markers")

@@ -24,6 +24,8 @@ NEAREST_M, FARTHEST_M = 0.4, 4.0
 MOST_BEARING, MOST_OBLIQUE = 0.5, math.radians(70.0)
 BORDER_PX = 6.0  # a marker is so far from the frame's border
 SUPER, CELL = 4, 16  # samples of a pixel and of a cell, along a side
+STANDARD_CODES = (0x1BD8A64AD10, 0x1BDC4F3B2D5, 0x1BDFF82B89A, 0x1BE3A11BE5F)
+"""The first ones of tagStandard41h12."""
 
 
 class Degraded(NamedTuple):
@@ -44,6 +46,13 @@ class Degraded(NamedTuple):
     def is_at(self, x: float, y: float) -> bool:
         """Whether the middle of a marker that was read is where this one is."""
         return math.dist(self.corners.mean(axis=0), (x, y)) < 0.4 * self.size_px
+
+
+class Pattern(NamedTuple):
+    """A marker's paper (n, n), and where on it the corners (4, 2) of its quad are."""
+
+    samples: Pixels
+    corners: NDArray[np.float64]
 
 
 class Subject(NamedTuple):
@@ -76,13 +85,16 @@ def degraded_frame(
         bearing = float(random.uniform(-MOST_BEARING, MOST_BEARING))
         facing = math.pi + bearing + float(random.uniform(-MOST_OBLIQUE, MOST_OBLIQUE))
         place = range_m * math.cos(bearing), range_m * math.sin(bearing)
-        corners = _project(_corners(place, facing, vision), settings, *lean)
+        quad, corners = (
+            _project(_corners(place, facing, vision, side_m), settings, *lean)
+            for side_m in (vision.marker_m, vision.marker_m * marker_ratio(family))
+        )
         low, high = corners.min(), corners.max(axis=0)
         size = np.array([settings.width_px, settings.height_px])
         if low > BORDER_PX and (high < size - BORDER_PX).all():
             break
     levels = background(backgrounds, random, settings)
-    _paste(levels, _pattern(family, number), corners, random)
+    _paste(levels, _pattern(family, number), quad, random)
     pixels = _through_camera(levels, kind, Subject(corners), random)
     heading = facing - QUARTERS[SIDES[number]]
     heading = math.remainder(heading, math.tau)
@@ -90,11 +102,11 @@ def degraded_frame(
 
 
 def _corners(
-    place: tuple[float, float], facing: float, vision: VisionSettings
+    place: tuple[float, float], facing: float, vision: VisionSettings, side_m: float
 ) -> NDArray[np.float64]:
     """The corners (4, 3; m) of a marker whose normal points to `facing`: from the upper left one as
     it is seen, clockwise."""
-    half, out = 0.5 * vision.marker_m, vision.marker_distance_m
+    half, out = 0.5 * side_m, vision.marker_distance_m
     normal = np.array([math.cos(facing), math.sin(facing), 0.0])
     right = np.array([-math.sin(facing), math.cos(facing), 0.0])
     middle = np.array([*place, vision.marker_mounted_m]) + out * normal
@@ -121,14 +133,41 @@ def _project(
     return np.stack([s.cx_px + s.fx_px * right / depth, s.cy_px + s.fy_px * down / depth], axis=1)
 
 
-def _pattern(family: MarkerFamily, number: int) -> Pixels:
+def marker_ratio(family: MarkerFamily) -> float:
+    """The side of a whole marker, over that of the square that `marker_m` is the side of."""
+    return 9.0 / 5.0 if family == "apriltag_standard41h12" else 1.0
+
+
+def _pattern(family: MarkerFamily, number: int) -> Pattern:
     """A marker of `CELL` samples a cell, with a margin of a cell and a half."""
-    name = f"DICT_{family.removeprefix('aruco_').upper()}"
-    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
-    side = CELL * (dictionary.markerSize + 2)
-    marker = cv2.aruco.generateImageMarker(dictionary, number, side)
-    margin = (CELL * 3 // 2,) * 4
-    return cv2.copyMakeBorder(marker, *margin, cv2.BORDER_CONSTANT, value=(255,)).astype(np.uint8)
+    if family == "apriltag_standard41h12":
+        cells = _standard_cells(STANDARD_CODES[number])
+        marker = cv2.resize(cells, None, None, CELL, CELL, cv2.INTER_NEAREST)
+    else:
+        name = f"DICT_{family.removeprefix('aruco_').upper()}"
+        dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
+        side = CELL * (dictionary.markerSize + 2)
+        marker = cv2.aruco.generateImageMarker(dictionary, number, side)
+    margin = CELL * 3 // 2
+    samples = cv2.copyMakeBorder(marker, *(margin,) * 4, cv2.BORDER_CONSTANT, value=(255,))
+    quad = len(marker) / marker_ratio(family)
+    first = 0.5 * (len(samples) - quad)
+    corners = first + quad * np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+    return Pattern(samples.astype(np.uint8), corners)
+
+
+def _standard_cells(code: int) -> Pixels:
+    """A marker of AprilTag's tagStandard41h12 as its library draws it, a pixel a cell: the bits go
+    round in four quarters, each from the outer ring to the inner one; the last is in the middle."""
+    bits = [255 * int(bit) for bit in f"{code:041b}"]
+    cells = np.zeros((9, 9), np.uint8)
+    cells[2:7, 2:7] = 255
+    for quarter in range(4):
+        turned = np.rot90(cells, quarter)  # a view
+        own = bits[10 * quarter : 10 * quarter + 10]
+        turned[0, :8], turned[3, 3:5] = own[:8], own[8:]
+    cells[4, 4] = bits[40]
+    return cells
 
 
 def background(backgrounds: Sequence[Pixels], random: Random, s: CameraSettings) -> Levels:
@@ -145,20 +184,20 @@ def background(backgrounds: Sequence[Pixels], random: Random, s: CameraSettings)
     return part.astype(np.float32)
 
 
-def _paste(levels: Levels, pattern: Pixels, corners: NDArray[np.float64], random: Random) -> None:
+def _paste(levels: Levels, pattern: Pattern, corners: NDArray[np.float64], random: Random) -> None:
     """Draws the marker's paper into the levels (height, width, 3), every pixel as the mean of what
-    it shows."""
+    it shows. `corners`: of the pattern's quad."""
     ink, paper = float(random.uniform(15.0, 45.0)), float(random.uniform(170.0, 235.0))
-    reach = 12.0 + 0.3 * np.ptp(corners, axis=0)
+    beyond = pattern.corners[0, 0] / np.ptp(pattern.corners[:, 0])
+    reach = 12.0 + max(0.3, 1.2 * beyond) * np.ptp(corners, axis=0)
     height, width = levels.shape[:2]
     x0, y0 = np.floor(corners.min(axis=0) - reach).astype(int).clip(0).tolist()
     x1, y1 = np.ceil(corners.max(axis=0) + reach).astype(int).clip(0, (width, height)).tolist()
-    margin, side = CELL * 3 // 2, pattern.shape[0] - 3 * CELL
-    square = np.array([[0, 0], [side, 0], [side, side], [0, side]]) + margin - 0.5
+    square = pattern.corners - 0.5
     shown = (corners - (x0, y0) + 0.5) * SUPER - 0.5
     way = cv2.getPerspectiveTransform(square.astype(np.float32), shown.astype(np.float32))
     size, small = (SUPER * (x1 - x0), SUPER * (y1 - y0)), (x1 - x0, y1 - y0)
-    shades = (ink + (paper - ink) * pattern / 255.0).astype(np.float32)
+    shades = (ink + (paper - ink) * pattern.samples / 255.0).astype(np.float32)
     drawn, mask = (cv2.warpPerspective(flat, way, size) for flat in (shades, np.ones_like(shades)))
     colour = cv2.resize(drawn * mask, small, interpolation=cv2.INTER_AREA)[..., None]
     share = cv2.resize(mask, small, interpolation=cv2.INTER_AREA)[..., None]

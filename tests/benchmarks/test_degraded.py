@@ -4,11 +4,17 @@ The bounds of recall are below those of the better of OpenCV's detector and pupi
 frames of `make bench-degraded` by what 20 frames leave to chance.
 """
 
+from pathlib import Path
+
+import cv2
 import numpy as np
 import pytest
 from benchmarks.degraded import false_markers, measured, printed
 from benchmarks.degraded_frames import KINDS, textures
+from benchmarks.photographs import tags_read
+from benchmarks.readers import opencv_reader, own_reader
 
+from cpcbl_agents.vision.marker_families import opencv_dictionary
 from cpcbl_team.config import MarkerFamily
 
 FRAMES = 20
@@ -25,6 +31,18 @@ LEAST_RECALL = {
     "jpeg": 0.65,
     "noise": 0.65,
 }
+
+
+LEAST_STANDARD_RECALL = {"clean": 0.6, "low light": 0.4, "occlusion": 0.5, "noise": 0.5}
+
+
+@pytest.mark.parametrize("kind", LEAST_STANDARD_RECALL)
+def test_standard_tags_are_recalled_and_none_is_wrong(kind: str) -> None:
+    backgrounds = textures(4, np.random.default_rng(3))
+    score = measured(kind, FRAMES, "apriltag_standard41h12", backgrounds, seed=2)
+    assert score.wrong == 0
+    assert score.recall >= LEAST_STANDARD_RECALL[kind]
+    assert max(max(errors, default=0.0) for errors in score.errors.values()) < 3.0
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -47,3 +65,19 @@ def test_no_marker_is_in_pictures_without_one(frames: int) -> None:
     families: tuple[MarkerFamily, ...] = ("aruco_4x4_50", "apriltag_16h5")
     for family in families:
         assert false_markers(family, backgrounds, frames, seed=1) == 0
+
+
+def test_the_tags_of_photographs_are_counted_where_they_are(tmp_path: Path) -> None:
+    family: MarkerFamily = "apriltag_36h11"
+    paper = np.full((300, 400), 255, np.uint8)
+    paper[40:120, 50:130] = cv2.aruco.generateImageMarker(opencv_dictionary(family), 5, 80)
+    cv2.imwrite(str(tmp_path / "two.jpg"), paper)
+    here, there = (
+        "(50 40), (130 40), (130 120), (50 120)",
+        "(250 40), (330 40), (330 120), (250 120)",
+    )
+    (tmp_path / "two.txt").write_text(f"5, {here}\n5, {there}\n7, {here}\n")
+    readers = {"own": own_reader(family), "OpenCV": opencv_reader(family)}
+    assert tags_read(tmp_path, readers) == (3, {"own": 1, "OpenCV": 1})
+    with pytest.raises(FileNotFoundError, match="no NAME"):
+        tags_read(tmp_path / "nothing", readers)

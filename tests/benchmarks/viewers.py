@@ -9,7 +9,7 @@ from benchmarks.frames import TEAM, VIEWER
 from cpcbl_agents.vision.camera import Camera, Pixels
 from cpcbl_agents.vision.cylinders import CylinderDetector
 from cpcbl_agents.vision.detector import CameraDetector
-from cpcbl_agents.vision.marker_codes import marker_dictionary
+from cpcbl_agents.vision.marker_families import opencv_dictionary
 from cpcbl_agents.vision.markers import MarkerDetector
 
 YARDSTICK = "OpenCV's marker detection"
@@ -19,7 +19,7 @@ Viewer = Callable[[Pixels], Any]
 
 def _viewers() -> dict[str, Viewer]:
     camera = Camera(TEAM.robots[VIEWER].camera)
-    dictionary = marker_dictionary(TEAM.vision.family)
+    dictionary = opencv_dictionary(TEAM.vision.family)
     return {
         EYES: CameraDetector(VIEWER, TEAM).detections,
         "of these, markers": MarkerDetector(VIEWER, TEAM, camera).detections,

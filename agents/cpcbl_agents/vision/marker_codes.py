@@ -5,7 +5,6 @@ Wang and Olson's AprilTag 2 (IROS 2016, section III-C): light that falls off ove
 bit. Small cells are sharpened, because blur mixes them with their neighbours.
 """
 
-from functools import lru_cache
 from math import comb
 from typing import NamedTuple
 
@@ -14,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cpcbl_agents.vision.camera import Floats, Pixels
+from cpcbl_agents.vision.marker_families import marker_layout
 from cpcbl_team.config import MarkerFamily
 
 MOST_ROWS = 32_766  # cv2.remap numbers the rows of its result with 16 bits
@@ -24,20 +24,17 @@ SHARPENING = 0.25
 MOST_CHANCE, MOST_CHANCE_SPOILT = 2e-4, 3e-5
 """That random bits are taken for a marker of the family: so many wrong bits are corrected. The
 second if a part of the border or the margin is covered, which is less evidence for a marker."""
-MOST_CORRECTED = 0.5  # share of the bits that a family could set right
+MOST_CORRECTED = 0.6  # share of the bits that a family could set right
 CLEAR_BITS = (
     0.45  # mean distance of the bits from the threshold; 1: as black or as white as the rings
 )
 
+OPENCV_TURNED: tuple[MarkerFamily, ...] = ("apriltag_16h5", "apriltag_25h9", "apriltag_36h11")
+"""Before version 5, OpenCV's AprilTags are upside down beside those of the AprilTag library
+(opencv/opencv#28823); robots are not."""
+
 _SQUARE = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]], np.float32)
 _WITHIN = np.array([[x, y] for y in (-0.2, 0.2) for x in (-0.2, 0.2)])
-
-
-@lru_cache(maxsize=8)
-def marker_dictionary(family: MarkerFamily) -> cv2.aruco.Dictionary:
-    """OpenCV's dictionary of a family."""
-    name = f"DICT_{family.removeprefix('aruco_').upper()}"
-    return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
 
 
 class MarkerCode(NamedTuple):
@@ -48,28 +45,27 @@ class MarkerCode(NamedTuple):
 
 
 class MarkerReader:
-    """Reads the markers of a family."""
+    """Reads the markers of a family: in the picture if its quads are dark, else in the negative."""
 
     def __init__(self, family: MarkerFamily) -> None:
-        self.dictionary = marker_dictionary(family)
-        self._bits = self.dictionary.markerSize
-        self.cells = self._bits + 2
-        """Of a marker's side, its black border too."""
-        self.is_printed_both_ways = family.startswith("apriltag")
-        """Before version 5, OpenCV's AprilTags are upside down beside those of the AprilTag library
-        (opencv/opencv#28823); robots are not."""
-        self._sample_points = _sample_points(self.cells)
-        along = np.arange(self.cells + 2)
+        self.layout = marker_layout(family)
+        self.is_printed_both_ways = family in OPENCV_TURNED
+        outer = max(1, (self.layout.side - self.layout.quad) // 2)
+        self._grid = self.layout.quad + 2 * outer
+        self._sample_points = _sample_points(self.layout.quad, outer)
+        along = np.arange(self._grid)
         from_side = np.minimum(along, along[::-1])
         rings = np.minimum(from_side[:, None], from_side)
         y, x = np.mgrid[-1.0 : 1.0 : 1j * len(along), -1.0 : 1.0 : 1j * len(along)]
         basis = np.stack([np.ones_like(x), x, y], axis=2)
-        self._margin, self._border, self._inside = rings == 0, rings == 1, rings > 1
+        self._margin, self._border = rings == outer - 1, rings == outer
+        self._data = ~(self._margin | self._border)
         self._margin_plane = _Plane(basis, self._margin)
         self._border_plane = _Plane(basis, self._border)
-        self._correction_rates = tuple(
-            _correction_rate(self.dictionary, chance)
-            for chance in (MOST_CHANCE_SPOILT, MOST_CHANCE)
+        self._codes = self._turned_codes()
+        self._correctable, self._correctable_spoilt = (
+            _correctable(self._codes.shape, self.layout.correctable, chance)
+            for chance in (MOST_CHANCE, MOST_CHANCE_SPOILT)
         )
 
     def read(self, grey: Pixels, quads: Floats) -> dict[int, MarkerCode]:
@@ -78,7 +74,7 @@ class MarkerReader:
         if not len(quads):
             return {}
         samples = sample_grey(grey, _project_to_quads(self._sample_points, quads))
-        in_cells = np.sort(samples.reshape(len(quads), self.cells + 2, self.cells + 2, -1), axis=3)
+        in_cells = np.sort(samples.reshape(len(quads), self._grid, self._grid, -1), axis=3)
         levels = in_cells[..., 1:-1].mean(axis=3)  # a small highlight is an extreme
         white, black = self._margin_plane.fit(levels), self._border_plane.fit(levels)
         middle = 0.5 * (white + black)
@@ -88,20 +84,38 @@ class MarkerReader:
         spoilt_border = (levels > middle)[:, self._border].mean(axis=1)
         spoilt_margin = (levels < middle)[:, self._margin].mean(axis=1)
         framed = (spoilt_border <= BORDER_SPOILT) & (spoilt_margin <= MARGIN_SPOILT)
-        framed &= 2.0 * half.min(axis=(1, 2)) > LEAST_CONTRAST
+        framed &= 2.0 * half[:, ~self._margin].min(axis=1) > LEAST_CONTRAST
         framed &= self._scatter(levels, white, black, middle) < MOST_SCATTER
         whole = (spoilt_border == 0.0) & (spoilt_margin == 0.0)
-        codes = {}
-        for i in framed.nonzero()[0].tolist():
-            shades = (_sharpened(levels[i] - middle[i]) / half[i])[self._inside]
-            if np.abs(shades).clip(max=1.0).mean() < CLEAR_BITS:
-                continue
-            square = (shades > 0.0).astype(np.uint8).reshape(self._bits, self._bits)
-            rate = self._correction_rates[int(whole[i])]
-            is_known, number, turns = self.dictionary.identify(square, rate)
-            if is_known:
-                codes[i] = MarkerCode(number, -turns % 4)
-        return codes
+        (at,) = framed.nonzero()
+        shades = _sharpened(levels[at] - middle[at]) / half[at]
+        bits = shades[:, self._data]
+        most = np.where(whole[at], self._correctable, self._correctable_spoilt)
+        most[np.abs(bits).clip(max=1.0).mean(axis=1) < CLEAR_BITS] = -1
+        return {
+            quad: code
+            for quad, code in zip(at.tolist(), self._identify(bits, most), strict=True)
+            if code is not None
+        }
+
+    def _identify(self, bits: Floats, most: NDArray[np.int64]) -> list[MarkerCode | None]:
+        """The markers whose bits (m, k; positive where bright) these are but for `most` (m,)."""
+        signs = np.where(bits > 0.0, 1.0, -1.0).astype(np.float32)
+        wrong = 0.5 * (self._codes.shape[1] - signs @ self._codes.T)
+        nearest = wrong.argmin(axis=1)
+        is_known = wrong[np.arange(len(wrong)), nearest] <= most
+        return [
+            MarkerCode(*divmod(one, 4)) if known else None
+            for one, known in zip(nearest.tolist(), is_known.tolist(), strict=True)
+        ]
+
+    def _turned_codes(self) -> NDArray[np.float32]:
+        """The bits of all markers in all four turns, (4 n, k): 1 where bright, else -1."""
+        beyond = (self._grid - self.layout.side) // 2
+        cells = np.pad(self.layout.cells, [(0, 0), (beyond, beyond), (beyond, beyond)])
+        turned = [np.rot90(cells, -first, (1, 2))[:, self._data] for first in range(4)]
+        codes = 2.0 * np.stack(turned, axis=1).reshape(4 * len(cells), -1) - 1.0
+        return np.asarray(-codes if self.layout.is_bright else codes, np.float32)
 
     def _scatter(self, levels: Floats, white: Floats, black: Floats, middle: Floats) -> Floats:
         """The standard deviation of border and margin from black and white, without what is spoilt,
@@ -126,33 +140,34 @@ class _Plane:
         return np.asarray(np.einsum("mk,ijk->mij", found, self._basis))
 
 
-def _correction_rate(dictionary: cv2.aruco.Dictionary, most_chance: float) -> float:
-    """The wrong bits that are corrected in a family, as a share of those that could be."""
-    bits = dictionary.markerSize**2
-    patterns, most = 4 * len(dictionary.bytesList), 0
-    for wrong in range(1, int(MOST_CORRECTED * dictionary.maxCorrectionBits) + 1):
+def _correctable(codes: tuple[int, ...], most: int, most_chance: float) -> int:
+    """The wrong bits that are set right in a family of so many codes and bits, of which its
+    distance allows `most`."""
+    (patterns, bits), found = codes, 0
+    for wrong in range(1, int(MOST_CORRECTED * most) + 1):
         if patterns * sum(comb(bits, k) for k in range(wrong + 1)) > most_chance * 2.0**bits:
             break
-        most = wrong
-    # Half a bit more than what OpenCV rounds down
-    return (most + 0.5) / dictionary.maxCorrectionBits if most else 0.0
+        found = wrong
+    return found
 
 
 def _sharpened(levels: Floats) -> Floats:
-    """A grid (n, n) with the differences of its cells from their neighbours enlarged; not at its
-    margin."""
-    sharp = levels.copy()
-    inner = levels[1:-1, 1:-1]
-    around = levels[:-2, 1:-1] + levels[2:, 1:-1] + levels[1:-1, :-2] + levels[1:-1, 2:]
-    sharp[1:-1, 1:-1] += SHARPENING * (4.0 * inner - around)
-    return sharp
+    """Grids (m, n, n) with the differences of their cells from their neighbours enlarged; what is
+    beyond counts as 0, neither black nor white."""
+    sharp = (1.0 + 4.0 * SHARPENING) * levels
+    sharp[:, 1:] -= SHARPENING * levels[:, :-1]
+    sharp[:, :-1] -= SHARPENING * levels[:, 1:]
+    sharp[..., 1:] -= SHARPENING * levels[..., :-1]
+    sharp[..., :-1] -= SHARPENING * levels[..., 1:]
+    return np.asarray(sharp)
 
 
-def _sample_points(cells: int) -> Floats:
-    """The points to sample in a marker with corners (0, 0) to (1, 1), and in a ring around it."""
-    middles = (np.arange(-1, cells + 1) + 0.5) / cells
+def _sample_points(quad: int, outer: int) -> Floats:
+    """The points to sample in a quad of so many cells with corners (0, 0) to (1, 1), and in the
+    `outer` rings of cells around it."""
+    middles = (np.arange(-outer, quad + outer) + 0.5) / quad
     x, y = np.meshgrid(middles, middles)
-    cell_points = np.stack([x, y], axis=2).reshape(-1, 1, 2) + _WITHIN / cells
+    cell_points = np.stack([x, y], axis=2).reshape(-1, 1, 2) + _WITHIN / quad
     return np.asarray(cell_points.reshape(-1, 2))
 
 

@@ -127,18 +127,20 @@ class MarkerDetector:
         if not self._mounts:
             return Detections()
         grey = cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY).astype(np.uint8, copy=False)
-        markers = self._detect_markers(grey, until_s)
+        markers = self.detect_markers(grey, until_s)
         own, ambiguities = assign_markers(markers, self._mounts, self._robot)
         found = Detections((), ambiguities)
         for name, sides in own.items():
             found |= self._locate(name, sides)
         return found
 
-    def _detect_markers(self, grey: Pixels, until_s: float = math.inf) -> list[DetectedMarker]:
-        """All markers of the family in a picture, those with the most exact outlines first. Which
-        quads are markers is read between corners that are nearly exact."""
+    def detect_markers(self, grey: Pixels, until_s: float = math.inf) -> list[DetectedMarker]:
+        """All markers of the family in a grey picture, those with the most exact outlines first.
+        Which quads are markers is read between corners that are nearly exact."""
+        if self._codes.layout.is_bright:
+            grey = cv2.bitwise_not(grey).astype(np.uint8, copy=False)
         quads, dropped = dark_quads(grey)
-        quads = _framed_quads(grey, quads, self._codes.cells)
+        quads = _framed_quads(grey, quads, self._codes.layout.quad)
         found: list[tuple[float, DetectedMarker]] = []
         for first in range(0, len(quads), BATCH):
             if first and time.thread_time() > until_s:
@@ -152,7 +154,7 @@ class MarkerDetector:
         """The markers among some quads (m, 4, 2), and by how much (px) the last pass moved their
         corners."""
         for _ in range(PASSES):
-            better = line_intersections(side_edge_points(grey, quads, self._codes.cells))
+            better = line_intersections(side_edge_points(grey, quads, self._codes.layout.quad))
             near = np.abs(better - quads).max(axis=(1, 2), initial=0.0) < FAR_PX
             quads = better[near]
             quads = quads[_shortest_sides(quads) > LEAST_SIDE_PX]
@@ -160,7 +162,7 @@ class MarkerDetector:
         if not codes:
             return []
         rough = quads[list(codes)]
-        sides = side_edge_points(grey, rough, self._codes.cells)
+        sides = side_edge_points(grey, rough, self._codes.layout.quad)
         exact = line_intersections(sides)
         undistorted = self._camera.undistort(sides.reshape(-1, 2)).reshape(sides.shape)
         planes = line_intersections(undistorted)
@@ -271,10 +273,11 @@ def _framed_quads(grey: Pixels, quads: Floats, cells: int) -> Floats:
     more, those of the largest difference first."""
     if not len(quads):
         return quads
+    middles = quads.mean(axis=1)[:, None, None]
     ways = quads[:, _NEXT] - quads
-    outwards = 0.5 / cells * ways[..., ::-1] * _OUTWARDS
-    places = quads[:, :, None] + _PROBES[:, None] * ways[:, :, None]
-    pairs = np.stack([places - outwards[:, :, None], places + outwards[:, :, None]], axis=3)
+    places = quads[:, :, None] + _PROBES[:, None] * ways[:, :, None] - middles
+    half_cell = places / cells  # also where the marker is seen from the side
+    pairs = np.stack([places - half_cell, places + half_cell], axis=3) + middles[:, :, None]
     levels = sample_grey(grey, pairs.reshape(len(quads), -1, 2)).reshape(pairs.shape[:-1])
     steps = levels[..., 1] - levels[..., 0]
     third = np.sort(np.median(steps, axis=2), axis=1)[:, 1]

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cpcbl_agents.vision.camera import Pixels
-from cpcbl_agents.vision.marker_codes import marker_dictionary
+from cpcbl_agents.vision.marker_families import NOT_IN_OPENCV, opencv_dictionary
 from cpcbl_launch.calibration.pictures import NamedPicture
 from cpcbl_launch.calibration.statistics import Estimate
 from cpcbl_launch.reporting.metrics import Floats
@@ -75,7 +75,7 @@ def parse_board(
     across, down = int(match[1]), int(match[2])
     if min(across, down) < MIN_SQUARES:
         raise InputError(f"--squares {squares}: at least {MIN_SQUARES} across and down")
-    markers = {str(name): name for name in MARKERS}
+    markers = {str(name): name for name in MARKERS if name not in NOT_IN_OPENCV}
     if family not in markers:
         raise InputError(f"--family {family}: no such family; use one of {', '.join(markers)}")
     board = Board(pattern, (across, down), square_m, marker_m, markers[family])
@@ -171,8 +171,8 @@ def _refine_corners(grey: Pixels, pixels: NDArray[np.floating], free: float) -> 
 
 
 def _charuco_board(board: Board) -> cv2.aruco.CharucoBoard:
-    family = marker_dictionary(board.family)
-    return cv2.aruco.CharucoBoard(board.squares, board.square_m, board.marker_m, family)
+    dictionary = opencv_dictionary(board.family)
+    return cv2.aruco.CharucoBoard(board.squares, board.square_m, board.marker_m, dictionary)
 
 
 class PictureResult(msgspec.Struct, frozen=True):

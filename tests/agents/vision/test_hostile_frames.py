@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 from support.cameras import calibrated
-from support.hostile_frames import tiles, turned_marker
+from support.hostile_frames import checkerboard, tiles, turned_marker
 from support.markers import CARRIED, picture, standing, team
 from support.rendered_pictures import picture as field_picture
 from support.rendered_pictures import post
@@ -32,6 +32,7 @@ TEAM, CAMERA = team(CARRIED), calibrated()
 @pytest.mark.parametrize("side_px", [6, 8, 10, 12, 16])
 def test_a_floor_of_tiles_costs_no_robot(side_px: int) -> None:
     detector = CameraDetector("me", TEAM)
+    assert detector.detections(checkerboard(side_px)) == Detections()
     assert detector.detections(tiles(side_px)) == Detections()
     assert detector.counts["outlines_dropped"] > 100
 

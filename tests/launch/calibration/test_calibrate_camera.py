@@ -226,6 +226,7 @@ def _only_left(pixels: Pixels) -> Pixels:
         (("charuco", "3x9", 0.03, 0.02, "aruco_4x4_50"), "at least 4"),
         (("charuco", "7x5", 0.03, 0.03, "aruco_4x4_50"), "--marker-m 0.03: .*less than"),
         (("charuco", "7x5", 0.03, 0.02, "aruco"), "--family aruco: .*apriltag_36h11"),
+        (("charuco", "7x5", 0.03, 0.02, "apriltag_standard41h12"), "no such family"),
         (("charuco", "12x12", 0.03, 0.02, "aruco_4x4_50"), "needs 72 markers, .*has 50"),
     ],
 )

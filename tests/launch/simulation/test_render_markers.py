@@ -18,7 +18,7 @@ from support.rendered_pictures import (
 )
 
 from cpcbl_agents.vision.camera import Camera, Floats
-from cpcbl_launch.simulation.camera.objects import quiet_zone_ratio
+from cpcbl_launch.simulation.camera.objects import paper_ratio
 from cpcbl_launch.simulation.camera.render import Light, SceneRobot
 from cpcbl_team.config import (
     CameraSettings,
@@ -104,5 +104,6 @@ def test_the_edges_of_a_marker_are_where_the_camera_model_says(
 
 
 def test_the_white_around_a_marker_is_one_module_wide() -> None:
-    assert quiet_zone_ratio("aruco_4x4_50") == pytest.approx(8 / 6)
-    assert quiet_zone_ratio("apriltag_36h11") == pytest.approx(10 / 8)
+    assert paper_ratio("aruco_4x4_50") == pytest.approx(8 / 6)
+    assert paper_ratio("apriltag_36h11") == pytest.approx(10 / 8)
+    assert paper_ratio("apriltag_standard41h12") == pytest.approx(11 / 5)  # of the white square

@@ -152,7 +152,7 @@ class TagInput:
         """A detection as a marker whose corners are in our order."""
         family = str(detection.family)
         expected = self._team.vision.family.removeprefix("apriltag_")
-        if family.removeprefix("tag").removeprefix("apriltag_") not in ("", expected):
+        if family.lower().removeprefix("tag").removeprefix("apriltag_") not in ("", expected):
             text = f"family {family!r}, but vision.family is {self._team.vision.family!r}"
             return Refused(BadMessage.WRONG_FAMILY, text)
         outline = np.array([[float(p.x), float(p.y)] for p in detection.corners])

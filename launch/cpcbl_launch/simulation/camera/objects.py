@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from cpcbl_agents.vision.camera import Box, Floats, Pixels
-from cpcbl_agents.vision.marker_codes import marker_dictionary
+from cpcbl_agents.vision.marker_families import marker_image, marker_layout
 from cpcbl_agents.vision.poses import SIDE_ANGLES
 from cpcbl_launch.simulation.camera.scene import Bgr, Scene, SceneCylinder, SceneRobot, with_stand
 from cpcbl_launch.simulation.camera.view import Grey, View, cross_products
@@ -126,7 +126,8 @@ def _tangent_planes(ex: float, ey: float, radius_m: float) -> list[Floats]:
 
 def body_top_m(vision: VisionSettings) -> float:
     """Bodies end where masts begin, but above their markers."""
-    return max(vision.mast.foot_m, vision.marker_mounted_m + 0.7 * vision.marker_m)
+    half_m = max(0.7, 0.5 * paper_ratio(vision.family)) * vision.marker_m
+    return max(vision.mast.foot_m, vision.marker_mounted_m + half_m)
 
 
 def robot_pieces(view: View, robot: SceneRobot, scene: Scene) -> list[Piece]:
@@ -160,7 +161,7 @@ def _robot_faces(robot: SceneRobot, scene: Scene) -> Iterator[Face]:
         yield Face(_upright(wall, along, half, 0.0, top_m), BODY)
         lid.append(wall + half * along + top_m * _UP)
         if side in numbers:
-            size = vision.marker_m / 2.0 * quiet_zone_ratio(vision.family)
+            size = vision.marker_m / 2.0 * paper_ratio(vision.family)
             low, high = vision.marker_mounted_m - size, vision.marker_mounted_m + size
             marker = vision.family, numbers[side]
             yield Face(_upright(wall, along, size, low, high), (PAPER,) * 3, marker)
@@ -181,7 +182,7 @@ def _render_marker(
     plane = view.homography(high_left, low_right - low_left, low_left - high_left)
     width, height = box.size
     finer = 4 if width * height <= 160 * 160 else 2
-    paper = _marker_image(family, number, _pixels_per_module(plane, finer))
+    paper = _marker_paper(family, number, _pixels_per_module(plane, finer))
     n = len(paper)
     unit_from_paper = np.array([[1.0 / n, 0.0, 0.5 / n], [0.0, 1.0 / n, 0.5 / n], [0.0, 0.0, 1.0]])
     shift_x, shift_y = ((0.5 - start) * finer - 0.5 for start in (box.left, box.top))
@@ -207,16 +208,14 @@ def _pixels_per_module(plane: Floats, finer: int) -> int:
 
 
 @lru_cache(maxsize=256)
-def _marker_image(family: MarkerFamily, number: int, detail: int) -> Pixels:
+def _marker_paper(family: MarkerFamily, number: int, detail: int) -> Pixels:
     """A marker with a quiet zone of one module around, grey, `detail` pixels a module."""
-    dictionary = marker_dictionary(family)
-    ink = cv2.aruco.generateImageMarker(dictionary, number, (dictionary.markerSize + 2) * detail)
-    paper = cv2.copyMakeBorder(ink, *(detail,) * 4, cv2.BORDER_CONSTANT, value=(255,))
-    shades: Pixels = np.where(paper > 127, PAPER, INK).astype(np.uint8)
+    image = marker_image(family, number, detail)
+    shades: Pixels = np.where(image > 127, PAPER, INK).astype(np.uint8)
     return shades
 
 
-def quiet_zone_ratio(family: MarkerFamily) -> float:
-    """The side of a marker with its quiet zone, over that of the marker."""
-    modules = marker_dictionary(family).markerSize + 2
-    return (modules + 2) / modules
+def paper_ratio(family: MarkerFamily) -> float:
+    """The side of a marker with its quiet zone, over that of the square that is looked for."""
+    layout = marker_layout(family)
+    return (layout.side + 2) / layout.quad

@@ -134,6 +134,19 @@ def seen_with(message: Any, team: Team | None = None) -> tuple[Any, list[Refused
     return own.take(message, T0), said
 
 
+@pytest.mark.parametrize(
+    ("family", "said"),
+    [("apriltag_36h11", "tag36h11"), ("apriltag_standard41h12", "tagStandard41h12")],
+)
+def test_tags_of_the_family_of_the_team_file_are_taken(family: str, said: str) -> None:
+    team = lab(('family = "apriltag_36h11"', f'family = "{family}"'))
+    corners = corners_of(team, true_camera(team), "door", "front", DOOR)
+    seen, refused = seen_with(detections(T0, detection(7, corners, said)), team)
+    assert isinstance(seen, Sightings)
+    assert [one.id for one in seen.sightings] == ["door"]
+    assert not refused
+
+
 def test_tags_that_give_no_sighting_are_said() -> None:
     team = lab()
     corners = corners_of(team, true_camera(team), "door", "front", DOOR)
