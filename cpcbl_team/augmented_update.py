@@ -181,7 +181,7 @@ def updated_by_landmark_belief(
     makes the pose no better. By covariance intersection of all that is estimated: what the teammate
     knows may have come from this robot. So less would be known of the errors of a camera after
     each; where these are uncertain it is not used."""
-    if any(common.camera_covariance):
+    if any(common.camera_sigmas):
         return prior, common
     sensitivities: tuple[Sensitivity, ...] = (((number, 1.0),), ((number + 1, 1.0),))
     estimated = estimated_of(common, False)

@@ -12,6 +12,7 @@ from cpcbl_team.augmented_update import (
     updated_by_landmark_belief,
     updated_by_teammate,
 )
+from cpcbl_team.camera_errors import NO_ERRORS, CameraErrors
 from cpcbl_team.common_errors import CommonErrors, inflated
 from cpcbl_team.config import CameraSettings, Field, LocalizationSettings
 from cpcbl_team.estimate import Estimate, Row
@@ -65,8 +66,12 @@ def considers_common_errors(settings: LocalizationSettings) -> bool:
 
 def considers_camera(settings: LocalizationSettings, camera: CameraSettings) -> bool:
     """Whether the filter keeps the errors of this camera apart from those of each sighting."""
-    is_exact = camera.yaw_sigma_deg == 0.0 and camera.focal_share == 0.0
-    return considers_common_errors(settings) and not is_exact
+    return considers_common_errors(settings) and camera_sigmas(camera) != NO_ERRORS
+
+
+def camera_sigmas(camera: CameraSettings) -> CameraErrors:
+    """The sigmas of the constant errors of a camera, by its settings."""
+    return CameraErrors(math.radians(camera.yaw_sigma_deg), camera.focal_share, camera.centre_share)
 
 
 def common_error_filter(
@@ -91,11 +96,10 @@ class CommonErrorFilter:
         self._field, self._sensor, self._noise = field, settings.sensor, settings.odometry
         self._learns_camera = camera is not None and camera.self_calibration
         self._splits = settings.collaboration.fusion == "split-ci"
-        self.prior = CommonErrors.of_camera(0.0, EXACT)
+        self.prior = CommonErrors.of_camera(0.0, NO_ERRORS)
         if camera is not None:
-            yaw, focal = math.radians(camera.yaw_sigma_deg) ** 2, camera.focal_share**2
             axis = math.radians(camera.yaw_deg)
-            self.prior = CommonErrors.of_camera(axis, Covariance2(yaw, 0.0, focal))
+            self.prior = CommonErrors.of_camera(axis, camera_sigmas(camera))
 
     def started(self, state: State) -> State:
         """The state in which nothing but the settings and the map is known."""
@@ -182,11 +186,12 @@ class CommonErrorFilter:
         for them."""
         common = state.common_errors
         assert common is not None
-        (yaw, _, focal), range_m = common.camera_covariance, m.range_m or 0.0
+        bearing = common.axis_rad if m.bearing is None else m.bearing
+        of_range, of_bearing = common.reading_variances(bearing)
         return replace(
             m,
-            range_sigma=math.hypot(m.range_sigma, math.sqrt(focal) * range_m),
-            bearing_sigma=math.hypot(m.bearing_sigma, math.sqrt(yaw)),
+            range_sigma=math.hypot(m.range_sigma, math.sqrt(of_range) * (m.range_m or 0.0)),
+            bearing_sigma=math.hypot(m.bearing_sigma, math.sqrt(of_bearing)),
         )
 
     def correct(self, state: State, accepted: Sequence[GatedObject]) -> tuple[State, Estimate]:

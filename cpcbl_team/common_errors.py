@@ -1,10 +1,10 @@
 """Errors that a robot's sightings have in common, as states beside its pose.
 
-All sightings of a camera have the errors of its yaw and of its focal length in common; all
-sightings of an object have the error of its place on the map in common. So these do not average
-away. The filter keeps them as parameters beside the pose (`parameters.py`), and so knows how
-uncertain they make the pose from the first frame on. The places are estimated with the pose, and
-the camera's errors where the camera may calibrate itself; else those are only considered.
+All sightings of a camera have the errors of its yaw, its focal length and its principal point in
+common; all sightings of an object have the error of its place on the map in common. So these do not
+average away. The filter keeps them as parameters beside the pose (`parameters.py`), and so knows
+how uncertain they make the pose from the first frame on. The places are estimated with the pose,
+and the camera's errors where the camera may calibrate itself; else those are only considered.
 """
 
 import math
@@ -17,6 +17,7 @@ from cpcbl_team.camera_errors import (
     bearing_sensitivity,
     heading_sensitivity,
     range_sensitivity,
+    reading_variances,
     without_errors,
 )
 from cpcbl_team.estimate import ZERO3, Estimate, Row, dot
@@ -31,11 +32,12 @@ from cpcbl_team.parameters import (
     sensitivity_dot,
 )
 
-DRIFT: Final = Covariance2(1e-7, 0.0, 1e-7)
+DRIFT: Final = (1e-7, 1e-7, 0.0)
 """Variances that a second adds: a camera is knocked now and then."""
-PRECISE: Final = Covariance2(math.radians(0.5) ** 2, 0.0, 0.01**2)
+PRECISE_BEARING, PRECISE_SHARE = math.radians(0.5) ** 2, 0.01**2  # variances of readings
+USUAL_VIEW_RAD: Final = (-0.5, 0.0, 0.5)  # from the optical axis
 PRECISE_PLACE: Final = 0.02**2  # m^2
-CAMERA: Final = 2  # the parameters of the camera come first
+CAMERA: Final = 3  # the parameters of the camera come first
 _NONE: Final[Mapping[str, int]] = MappingProxyType({})
 
 
@@ -44,37 +46,43 @@ class CommonErrors(NamedTuple):
     `values`; the parameters are what is left of them."""
 
     axis_rad: float  # the stated direction of the optical axis, left of the robot's front
-    values: Numbers  # of the camera: yaw (rad), focal length (logarithm); of each object: two
+    values: Numbers  # of the camera: as in `CameraErrors`; of each object: two
     parameters: Parameters
     objects: Mapping[str, int] = _NONE  # the number of the first parameter of each
     found: tuple[int, ...] = ()  # those of objects whose places nobody has surveyed
 
     @staticmethod
-    def of_camera(axis_rad: float, covariance: Covariance2) -> "CommonErrors":
+    def of_camera(axis_rad: float, sigmas: CameraErrors) -> "CommonErrors":
         """Of a camera of which nothing but its settings is known."""
-        xx, xy, yy = covariance
-        parameters = Parameters(((xx, xy), (xy, yy)), (NO_COVARIANCE, NO_COVARIANCE))
-        return CommonErrors(axis_rad, (0.0, 0.0), parameters)
+        yaw, focal, centre = sigmas
+        covariance = (yaw * yaw, 0.0, 0.0), (0.0, focal * focal, 0.0), (0.0, 0.0, centre * centre)
+        parameters = Parameters(covariance, (NO_COVARIANCE,) * CAMERA)
+        return CommonErrors(axis_rad, (0.0,) * CAMERA, parameters)
 
     @property
     def errors(self) -> CameraErrors:
         """The errors of the camera that are known."""
-        return CameraErrors(self.values[0], self.values[1])
+        return CameraErrors(*self.values[:CAMERA])
 
     @property
-    def camera_covariance(self) -> Covariance2:
-        """Of the yaw (rad^2) and the focal length."""
-        yaw, focal = self.parameters.covariance[:CAMERA]
-        return Covariance2(yaw[0], yaw[1], focal[1])
+    def camera_sigmas(self) -> CameraErrors:
+        """Of what is left of the errors of the camera."""
+        covariance = self.parameters.covariance
+        return CameraErrors(*(math.sqrt(max(covariance[i][i], 0.0)) for i in range(CAMERA)))
+
+    def reading_variances(self, bearing_rad: float) -> tuple[float, float]:
+        """What the camera adds to the variance of a reading at this bearing: of the range, as a
+        share of it, and of the bearing (rad^2)."""
+        return reading_variances(self.parameters.covariance, bearing_rad - self.axis_rad)
 
     @property
     def is_precise(self) -> bool:
         """Whether they are known well enough not to matter beside other errors."""
-        covariance = self.parameters.covariance
-        yaw, focal = covariance[0][0], covariance[1][1]
         places = (max(self.place_covariance(name)[::2]) for name in self.objects)
-        is_precise = all(variance < PRECISE_PLACE for variance in places)
-        return is_precise and yaw < PRECISE.xx and focal < PRECISE.yy
+        if any(variance >= PRECISE_PLACE for variance in places):
+            return False
+        readings = [self.reading_variances(self.axis_rad + a) for a in USUAL_VIEW_RAD]
+        return all(r < PRECISE_SHARE and b < PRECISE_BEARING for r, b in readings)
 
     def place_error(self, name: str) -> tuple[float, float]:
         """What is known of the error of an object's place: x, y (m) of a point; offset (m) and
@@ -151,12 +159,14 @@ class CommonErrors(NamedTuple):
 
     def after_time(self, seconds: float) -> "CommonErrors":
         """After this time, in which the camera may have been knocked."""
-        (yaw, focal, *others), with_pose = self.parameters
-        if yaw[0] == 0.0 and focal[1] == 0.0:  # there is no camera
+        covariance, with_pose = self.parameters
+        if not any(covariance[i][i] for i in range(CAMERA)):  # there is no camera
             return self
-        yaw = (yaw[0] + DRIFT.xx * seconds, *yaw[1:])
-        focal = (focal[0], focal[1] + DRIFT.yy * seconds, *focal[2:])
-        return self._replace(parameters=Parameters((yaw, focal, *others), with_pose))
+        rows = list(covariance)
+        for i, drift in enumerate(DRIFT):
+            row = rows[i]
+            rows[i] = (*row[:i], row[i] + drift * seconds, *row[i + 1 :])
+        return self._replace(parameters=Parameters(tuple(rows), with_pose))
 
     def sensitivity(
         self,
@@ -171,11 +181,11 @@ class CommonErrors(NamedTuple):
         differs from that of a bearing (1, or m)."""
         off_axis = 0.0 if bearing_rad is None else bearing_rad - self.axis_rad
         if is_bearing:  # its residual falls when the bearing grows
-            yaw, focal = bearing_sensitivity(off_axis)
-            of_camera = (0, -lever * yaw), (1, -lever * focal)
+            yaw, focal, centre = bearing_sensitivity(off_axis)
+            of_camera = (0, -lever * yaw), (1, -lever * focal), (2, -lever * centre)
         else:
-            yaw, focal = range_sensitivity(range_m or 0.0, off_axis)
-            of_camera = (0, yaw), (1, focal)
+            yaw, focal, centre = range_sensitivity(range_m or 0.0, off_axis)
+            of_camera = (0, yaw), (1, focal), (2, centre)
         i = self.objects.get(name)
         if i is None:
             return of_camera
@@ -197,8 +207,9 @@ class CommonErrors(NamedTuple):
     def of_heading(self, sighting: Sighting) -> float:
         """What they add to the variance (rad^2) of the heading of a sighted teammate in the field.
         It may be negative: they explain errors of the pose."""
-        by_focal = heading_sensitivity(sighting, self.axis_rad)
-        return self.innovation(((0.0, 0.0, 1.0),), (((0, -1.0), (1, -by_focal)),)).xx
+        errors = heading_sensitivity(sighting, self.axis_rad)
+        sensitivity = tuple([(i, -factor) for i, factor in enumerate(errors)])
+        return self.innovation(((0.0, 0.0, 1.0),), (sensitivity,)).xx
 
     def of_point(self, dx: float, dy: float, bearing_rad: float) -> Covariance2:
         """What they add to the covariance (m^2) of a point that is seen at this bearing, (dx, dy)
@@ -211,11 +222,12 @@ class CommonErrors(NamedTuple):
     ) -> tuple[Sensitivity, Sensitivity]:
         """How the place of such a point follows the errors of the camera."""
         off_axis = bearing_rad - self.axis_rad
-        _, along = range_sensitivity(1.0, off_axis)
-        _, across = bearing_sensitivity(off_axis)
+        ways = list(
+            zip(range_sensitivity(1.0, off_axis), bearing_sensitivity(off_axis), strict=True)
+        )
         # a reading that is too large puts the point too far
-        of_x = (0, dy), (1, -along * dx + across * dy)
-        of_y = (0, -dx), (1, -along * dy - across * dx)
+        of_x = tuple([(i, -along * dx + across * dy) for i, (along, across) in enumerate(ways)])
+        of_y = tuple([(i, -along * dy - across * dx) for i, (along, across) in enumerate(ways)])
         return of_x, of_y
 
 

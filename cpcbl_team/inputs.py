@@ -43,10 +43,12 @@ class MarkerSighting(Sighting, frozen=True, array_like=True):
     """A sighting of a teammate by its markers. On the wire it is a `Sighting`.
 
     `heading_per_focal` (rad): by how much the heading is read too large if the true focal length is
-    larger than the stated one, a unit of the logarithm of their ratio.
+    larger than the stated one, a unit of the logarithm of their ratio. `heading_per_centre` (rad):
+    by how much if the principal point is one focal length to the left of the stated one.
     """
 
     heading_per_focal: float = 0.0
+    heading_per_centre: float = 0.0
 
 
 class SightingFault(StrEnum):

@@ -92,6 +92,33 @@ def with_heading_error(evidence: Sums, variance: float) -> Sums:
     )
 
 
+def with_position_error(evidence: Sums, covariance: Covariance2) -> Sums:
+    """The evidence of one report, to which the error of the position of the estimate adds this
+    covariance (m^2). That error too changes from one report to the next, with odometry and
+    corrections. Without it, reports that are precise along lines that are nearly parallel, like the
+    ranges of a teammate that is followed, would meet far from all of them."""
+    (xx, xy, yy, xh, yh, hh), (x, y, h) = evidence
+    vxx, vxy, vyy = covariance
+    # K = V (I + A V)^-1, with the part A of the matrix that is about the position
+    a, b = 1.0 + xx * vxx + xy * vxy, xx * vxy + xy * vyy
+    c, d = xy * vxx + yy * vxy, 1.0 + xy * vxy + yy * vyy
+    k = 1.0 / (a * d - b * c)
+    kxx, kxy, kyy = k * (vxx * d - vxy * c), k * (vxy * a - vxx * b), k * (vyy * a - vxy * b)
+    # The rest is (I - A K) times the evidence.
+    rxx, rxy = 1.0 - xx * kxx - xy * kxy, -xx * kxy - xy * kyy
+    ryx, ryy = -xy * kxx - yy * kxy, 1.0 - xy * kxy - yy * kyy
+    gx, gy = kxx * xh + kxy * yh, kxy * xh + kyy * yh
+    matrix = Covariance3(
+        rxx * xx + rxy * xy,
+        rxx * xy + rxy * yy,
+        ryx * xy + ryy * yy,
+        rxx * xh + rxy * yh,
+        ryx * xh + ryy * yh,
+        hh - xh * gx - yh * gy,
+    )
+    return matrix, (rxx * x + rxy * y, ryx * x + ryy * y, h - gx * x - gy * y)
+
+
 class FadingOffsets(NamedTuple):
     """Fading sums over the reports of one source."""
 

@@ -19,7 +19,13 @@ from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.inflation import inflate_by_offset, inflate_to
 from cpcbl_team.inputs import Belief, Input, LandmarkBelief, Position, Sightings
 from cpcbl_team.landmarks import LandmarkUpdate
-from cpcbl_team.mean_offsets import HEADING_VARIANCE, NOTHING, about_position, with_heading_error
+from cpcbl_team.mean_offsets import (
+    HEADING_VARIANCE,
+    NOTHING,
+    about_position,
+    with_heading_error,
+    with_position_error,
+)
 from cpcbl_team.measurements import (
     GatedObject,
     GatedObjects,
@@ -264,8 +270,9 @@ class TeammateScreen:
 
 
 def _evidence_at(state: State, sums: Sums, dependent: Covariance2 = NOTHING) -> OffsetEvidence:
-    """Sums about the offset of the state's estimate, with the variances of that."""
+    """Sums about the offset of the state's estimate, with the error of its position in them."""
     c = state.estimate.covariance
+    sums = with_position_error(sums, Covariance2(c.xx, c.xy, c.yy))
     return OffsetEvidence(sums, dependent, c.hh, c.xx + c.yy)
 
 
@@ -290,7 +297,8 @@ def _own_offset(state: State, sums: Information, accepted: Iterable[GatedObject]
         both = covariance[i][j]
         xx, xy, yy = xx + ax * bx * both, xy + ax * by * both, yy + ay * by * both
     position = _without_heading(sums, variance)
-    return _evidence_at(state, position, Covariance2(xx, xy, yy)).weighted(INDEPENDENT_FRAMES)
+    of_frame = OffsetEvidence(position).weighted(INDEPENDENT_FRAMES).evidence
+    return _evidence_at(state, of_frame, Covariance2(xx, xy, yy))
 
 
 def _with_camera(state: State, m: Measurement, evidence: OffsetEvidence) -> OffsetEvidence:
@@ -300,10 +308,10 @@ def _with_camera(state: State, m: Measurement, evidence: OffsetEvidence) -> Offs
     if common is None:
         sums = with_heading_error(evidence.evidence, evidence.heading_variance)
         return evidence._replace(evidence=sums)
-    (yy, _, ff), pose = common.camera_covariance, state.estimate.pose
-    x, y, covariance = m.position
+    (x, y, covariance), pose = m.position, state.estimate.pose
+    of_camera = common.reading_variances(common.axis_rad if m.bearing is None else m.bearing)
     squared = (x - pose.x) ** 2 + (y - pose.y) ** 2
-    variance = 0.5 * (covariance.xx + covariance.yy + squared * (yy + ff))
+    variance = 0.5 * (covariance.xx + covariance.yy + squared * sum(of_camera))
     sums = _without_heading(evidence.evidence, evidence.heading_variance)
     return evidence._replace(evidence=sums, dependent=Covariance2(variance, 0.0, variance))
 

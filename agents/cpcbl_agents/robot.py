@@ -293,5 +293,5 @@ def _without_common_errors(name: str, team: Team) -> Team:
     settings = team.robots[name]
     if not considers_camera(settings, settings.camera):
         return team
-    camera = replace(settings.camera, yaw_sigma_deg=0.0, focal_share=0.0)
+    camera = replace(settings.camera, yaw_sigma_deg=0.0, focal_share=0.0, centre_share=0.0)
     return replace(team, robots={**team.robots, name: replace(settings, camera=camera)})

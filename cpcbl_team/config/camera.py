@@ -70,10 +70,13 @@ class CameraSettings(Table, frozen=True, kw_only=True):
     """The accuracy of the yaw: an error that all bearings have in common."""
     focal_share: NotNegative = 0.025
     """The accuracy of the focal length as a share: an error that all ranges have in common."""
+    centre_share: NotNegative = 0.025
+    """The accuracy of the principal point `cx_px`, as a share of the focal length: an error that
+    all bearings have in common, more in the middle of the image than at its edges."""
 
     self_calibration: bool = True
-    """Whether the robot corrects its yaw and its focal length while it drives, where landmarks and
-    odometry show that they are wrong."""
+    """Whether the robot corrects its yaw, its focal length and its principal point while it drives,
+    where landmarks and odometry show that they are wrong."""
 
     @property
     def live(self) -> bool:

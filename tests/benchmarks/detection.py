@@ -134,12 +134,13 @@ class DetectionReport(ExperimentResult, frozen=True, kw_only=True):
 
 @lru_cache(maxsize=1)
 def team() -> Team:
-    """The team of the demonstration with cameras, whose yaw and focal length are known well."""
+    """The team of the demonstration with cameras, whose yaw and focal length are known well, and
+    whose principal points are exact in these images."""
     team = load_team(builtin_path("eyes"))
     robots = {}
     for name, robot in team.robots.items():
         sigma_deg, share = CALIBRATED_SPOTTER if name == "spotter" else CALIBRATED
-        camera = replace(robot.camera, yaw_sigma_deg=sigma_deg, focal_share=share)
+        camera = replace(robot.camera, yaw_sigma_deg=sigma_deg, focal_share=share, centre_share=0.0)
         robots[name] = replace(robot, camera=camera)
     return replace(team, robots=robots)
 

@@ -40,7 +40,8 @@ NOISE = OdometrySettings(
     turn_sigma_rad_per_sqrt_m=0.05,
 )
 YAW, FOCAL = CameraErrors(math.radians(3.0), 0.0), CameraErrors(0.0, 0.05)
-BOTH = CameraErrors(math.radians(-3.0), -0.05)
+BOTH, CENTRE = CameraErrors(math.radians(-3.0), -0.05), CameraErrors(0.0, 0.0, 0.05)
+ALL = CameraErrors(math.radians(2.0), 0.04, -0.04)
 
 
 class Drive(NamedTuple):
@@ -60,7 +61,8 @@ def localizer_of(drive: Drive) -> Localizer:
 def read_by(true: Sighting, errors: CameraErrors, axis_rad: float) -> Sighting:
     """What a camera with these errors reads in place of a sighting."""
     turned = replace(true, bearing_rad=wrap_angle((true.bearing_rad or 0.0) + errors.yaw_rad))
-    return without_errors(turned, CameraErrors(0.0, -errors.focal), axis_rad)
+    magnified = without_errors(turned, CameraErrors(0.0, -errors.focal), axis_rad)
+    return without_errors(magnified, CameraErrors(0.0, 0.0, -errors.centre), axis_rad)
 
 
 def frame_at(pose: Pose2, drive: Drive, random: np.random.Generator) -> tuple[Sighting, ...]:
@@ -109,7 +111,7 @@ def full(c: Covariance3) -> np.ndarray:
     return np.array([[c.xx, c.xy, c.xh], [c.xy, c.yy, c.yh], [c.xh, c.yh, c.hh]])
 
 
-@pytest.mark.parametrize("errors", [NO_ERRORS, YAW, FOCAL, BOTH], ids=str)
+@pytest.mark.parametrize("errors", [NO_ERRORS, YAW, FOCAL, BOTH, CENTRE, ALL], ids=str)
 @pytest.mark.parametrize("yaw_deg", [0.0, 90.0])
 @pytest.mark.parametrize("learns", [True, False])
 def test_a_wrong_camera_is_reckoned_with_from_the_first_frame(
@@ -124,14 +126,14 @@ def test_a_wrong_camera_is_reckoned_with_from_the_first_frame(
     assert all(state.counts.get("gated", 0) <= 8 for state, _ in (found[-1] for found in runs))
 
 
-@pytest.mark.parametrize("errors", [YAW, FOCAL, BOTH], ids=str)
+@pytest.mark.parametrize("errors", [YAW, FOCAL, BOTH, CENTRE, ALL], ids=str)
 def test_without_it_the_robot_is_certain_and_wrong(errors: CameraErrors) -> None:
     """The test above can fail."""
     found = run(Drive(errors, is_considered=False), 0)
     assert np.mean([nees(state.estimate, pose) for state, pose in found]) > 10.0
 
 
-@pytest.mark.parametrize("errors", [YAW, FOCAL, BOTH], ids=str)
+@pytest.mark.parametrize("errors", [YAW, FOCAL, BOTH, CENTRE, ALL], ids=str)
 def test_the_errors_are_learnt_and_what_is_learnt_is_as_certain_as_said(
     errors: CameraErrors,
 ) -> None:
@@ -140,9 +142,9 @@ def test_the_errors_are_learnt_and_what_is_learnt_is_as_certain_as_said(
         common = state.common_errors
         assert common is not None
         left = np.array(errors) - np.array(common.errors)
-        sigmas = np.sqrt([common.camera_covariance.xx, common.camera_covariance.yy])
+        sigmas = np.array(common.camera_sigmas)
         assert (np.abs(left) < 3.5 * sigmas).all()
-        assert (sigmas < (math.radians(0.7), 0.01)).all()
+        assert (sigmas < (math.radians(0.7), 0.01, 0.012)).all()
         exact, true = run(Drive(NO_ERRORS), seed)[-1]
         away = math.hypot(state.estimate.pose.x - pose.x, state.estimate.pose.y - pose.y)
         assert away < math.hypot(exact.estimate.pose.x - true.x, exact.estimate.pose.y - true.y) + (
@@ -152,14 +154,14 @@ def test_the_errors_are_learnt_and_what_is_learnt_is_as_certain_as_said(
 
 def test_an_update_is_that_of_an_augmented_kalman_filter() -> None:
     random = np.random.default_rng(3)
-    root = random.normal(size=(5, 5))
+    root = random.normal(size=(6, 6))
     p = root @ root.T
     cov = Covariance3(p[0, 0], p[0, 1], p[1, 1], p[0, 2], p[1, 2], p[2, 2])
-    common = CommonErrors(0.0, (0.0, 0.0), parameters_of(p))
-    x = np.zeros(5)
+    common = CommonErrors(0.0, (0.0, 0.0, 0.0), parameters_of(p))
+    x = np.zeros(6)
     update = AugmentedUpdate(cov, common, estimated_of(common, with_camera=True))
     for _ in range(3):
-        h, residual, variance = random.normal(size=5), float(random.normal()), 0.3
+        h, residual, variance = random.normal(size=6), float(random.normal()), 0.3
         update.add(Reading(tuple(h[:3]), tuple(enumerate(h[3:])), residual, variance))
         total = h @ p @ h + variance
         x = x + p @ h * (residual - h @ x) / total
@@ -168,23 +170,23 @@ def test_an_update_is_that_of_an_augmented_kalman_filter() -> None:
     assert estimate.pose == pytest.approx((x[0], x[1], wrap_angle(x[2])))
     assert full(estimate.covariance) == pytest.approx(p[:3, :3])
     assert common.errors == pytest.approx(x[3:])
-    assert common.camera_covariance == pytest.approx((p[3, 3], p[3, 4], p[4, 4]))
+    assert np.array(common.parameters.covariance) == pytest.approx(p[3:, 3:])
     assert np.array(common.parameters.with_pose) == pytest.approx(p[3:, :3])
 
 
 @pytest.mark.parametrize("by_markers", [False, True])
 def test_a_fix_is_as_uncertain_as_the_camera_makes_it(by_markers: bool) -> None:
-    """Its observer's part is the covariance of a point by pose, yaw and focal length."""
+    """Its observer's part is the covariance of a point by pose and camera."""
     random = np.random.default_rng(5)
-    root = random.normal(size=(5, 5)) * np.array([0.05, 0.05, 0.03, 0.03, 0.02])[:, None]
+    root = random.normal(size=(6, 6)) * np.array([0.05, 0.05, 0.03, 0.03, 0.02, 0.03])[:, None]
     p = root @ root.T
     cov = Covariance3(p[0, 0], p[0, 1], p[1, 1], p[0, 2], p[1, 2], p[2, 2])
-    common = CommonErrors(0.4, (0.0, 0.0), parameters_of(p))
+    common = CommonErrors(0.4, (0.0, 0.0, 0.0), parameters_of(p))
     pose, numbers = Pose2(1.0, 2.0, 0.7), ("mate", 3.0, 0.9, 0.001, 0.001, 0.2, 0.01)
-    read = MarkerSighting(*numbers, -0.6) if by_markers else Sighting(*numbers)
+    read = MarkerSighting(*numbers, -0.6, 0.4) if by_markers else Sighting(*numbers)
 
     def seen(e: np.ndarray) -> np.ndarray:
-        true = without_errors(read, CameraErrors(float(e[3]), float(e[4])), 0.4)
+        true = without_errors(read, CameraErrors(*e[3:].tolist()), 0.4)
         at = Pose2(pose.x + e[0], pose.y + e[1], pose.heading + e[2])
         assert true.range_m
         assert true.bearing_rad
@@ -194,7 +196,7 @@ def test_a_fix_is_as_uncertain_as_the_camera_makes_it(by_markers: bool) -> None:
         return np.array([*point, at.heading + true.heading_rad])
 
     step_ = 1e-5
-    jacobian = np.array([(seen(step_ * e) - seen(-step_ * e)) / (2 * step_) for e in np.eye(5)]).T
+    jacobian = np.array([(seen(step_ * e) - seen(-step_ * e)) / (2 * step_) for e in np.eye(6)]).T
     fix = fix_for("me", 0, Estimate(pose, cov), read, SensorSettings(), common=common)
     alone = fix_for("me", 0, Estimate(pose, cov), read, SensorSettings())
     assert fix is not None
@@ -214,7 +216,8 @@ def test_a_robot_without_a_camera_knows_nothing_of_one() -> None:
 def test_exact_cameras_and_variants_that_keep_the_heading_apart_have_no_common_errors() -> None:
     usual, camera = LocalizationSettings(), CameraSettings()
     assert considers_camera(usual, camera)
-    assert not considers_camera(usual, CameraSettings(yaw_sigma_deg=0.0, focal_share=0.0))
+    exact = CameraSettings(yaw_sigma_deg=0.0, focal_share=0.0, centre_share=0.0)
+    assert not considers_camera(usual, exact)
     for rules in (LocalizerSettings(variant="oval"), LocalizerSettings(alternate=True)):
         assert not considers_camera(replace(usual, localizer=rules), camera)
 

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from support.core import SECOND, localizer
 
-from cpcbl_team.common_errors import CommonErrors
+from cpcbl_team.camera_errors import NO_ERRORS
+from cpcbl_team.common_errors import CAMERA, CommonErrors
 from cpcbl_team.config import Field, Unsurveyed
 from cpcbl_team.estimate import Covariance3, Estimate
 from cpcbl_team.frame_changes import (
@@ -16,7 +17,6 @@ from cpcbl_team.frame_changes import (
     frame_change,
 )
 from cpcbl_team.frames import ORIGIN
-from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.geometry import Pose2, wrap_angle
 from cpcbl_team.inputs import Odometry
 from cpcbl_team.parameters import Parameters
@@ -27,7 +27,7 @@ FIELD = Field(unsurveyed={name: Unsurveyed() for name in NAMES})
 ROBOT = localizer(field=FIELD)
 OLD_POSE, NEW_POSE = Pose2(2.0, 1.0, 0.7), Pose2(-8.0, 5.0, -2.0)
 PLACES = np.array([3.0, 2.5, -1.0, 4.0, 6.0, -2.0])
-NO_CAMERA = CommonErrors.of_camera(0.0, Covariance2(0.0, 0.0, 0.0))
+NO_CAMERA = CommonErrors.of_camera(0.0, NO_ERRORS)
 
 
 def random_covariance(random: np.random.Generator, size: int, sigma: float) -> np.ndarray:
@@ -46,14 +46,17 @@ def full(c: Covariance3) -> np.ndarray:
 def state_with(pose: Pose2, joint: np.ndarray, places: np.ndarray) -> State:
     """A robot at a pose, with places of landmarks; their joint covariance."""
     n = len(places)
-    zeros = np.zeros((n + 2, n + 2))
-    zeros[2:, 2:] = joint[3:, 3:]
-    with_pose = np.vstack([np.zeros((2, 3)), joint[3:, :3]])
+    zeros = np.zeros((n + CAMERA, n + CAMERA))
+    zeros[CAMERA:, CAMERA:] = joint[3:, 3:]
+    with_pose = np.vstack([np.zeros((CAMERA, 3)), joint[3:, :3]])
     parameters = Parameters(tuple(map(tuple, zeros)), tuple(map(tuple, with_pose)))
-    numbers = tuple(range(2, n + 2, 2))
+    numbers = tuple(range(CAMERA, n + CAMERA, 2))
     objects = dict(zip(NAMES, numbers, strict=False))
     common = NO_CAMERA._replace(
-        values=(0.0, 0.0, *places), parameters=parameters, objects=objects, found=numbers
+        values=((0.0,) * CAMERA + tuple(places)),
+        parameters=parameters,
+        objects=objects,
+        found=numbers,
     )
     state = State(SECOND, Estimate(pose, covariance3(joint[:3, :3])), odometry_until_ns=SECOND)
     return with_common_errors(state, common)
@@ -68,13 +71,13 @@ def joint_of(state: State) -> tuple[np.ndarray, np.ndarray]:
     """The pose and the places of a state, and their covariance."""
     common = state.common_errors
     assert common is not None
-    n = len(common.values) - 2
+    n = len(common.values) - CAMERA
     covariance = np.zeros((n + 3, n + 3))
     covariance[:3, :3] = full(state.estimate.covariance)
-    covariance[3:, 3:] = np.array(common.parameters.covariance)[2:, 2:]
-    cross = np.array(common.parameters.with_pose)[2:]
+    covariance[3:, 3:] = np.array(common.parameters.covariance)[CAMERA:, CAMERA:]
+    cross = np.array(common.parameters.with_pose)[CAMERA:]
     covariance[3:, :3], covariance[:3, 3:] = cross, cross.T
-    return np.array([*state.estimate.pose, *common.values[2:]]), covariance
+    return np.array([*state.estimate.pose, *common.values[CAMERA:]]), covariance
 
 
 def test_places_stand_where_the_robot_sees_them() -> None:

@@ -3,11 +3,12 @@
 import math
 import random
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cpcbl_team.estimate import Information
+from cpcbl_team.estimate import Covariance3, Information
 from cpcbl_team.fusion import Observation
 from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.mean_offsets import (
@@ -23,6 +24,7 @@ from cpcbl_team.mean_offsets import (
     compared_with_own_sensors,
     disagreement,
     with_heading_error,
+    with_position_error,
 )
 
 SECOND = 1_000_000_000
@@ -109,6 +111,41 @@ def test_the_error_of_the_estimate_changes_no_comparison(
 def test_a_difference_within_the_noise_is_no_bias() -> None:
     assert bias_variance(at(0.0), at(0.015)) == 0.0
     assert bias_variance(at(0.0), at(0.1)) == pytest.approx(0.1**2 - 4e-4)
+
+
+def test_the_error_of_the_position_is_added_to_the_noise() -> None:
+    """Against the general form: the inverse of the matrix grows by the covariance."""
+    random_ = np.random.default_rng(2)
+    root = random_.normal(size=(4, 3))
+    matrix, offset = root.T @ root, random_.normal(size=3)
+    added = np.zeros((3, 3))
+    added[:2, :2] = [[0.3, 0.1], [0.1, 0.2]]
+    due = np.linalg.inv(np.linalg.inv(matrix) + added)
+    order = (0, 0), (0, 1), (1, 1), (0, 2), (1, 2), (2, 2)
+    sums = Covariance3(*(float(matrix[i]) for i in order)), tuple((matrix @ offset).tolist())
+    found, vector = with_position_error(sums, Covariance2(0.3, 0.1, 0.2))
+    assert found == pytest.approx([due[i] for i in order])
+    assert vector == pytest.approx(due @ offset)
+    assert with_position_error(sums, NOTHING) == sums
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_ranges_to_one_that_is_followed_do_not_meet_far_from_all_of_them(seed: int) -> None:
+    """Precise along lines that are nearly parallel, while the estimate moves by centimetres."""
+    dice, sums, raw = random.Random(seed), FadingOffsets(), FadingOffsets()
+    error = Covariance2(0.03**2, 0.0, 0.03**2)
+    for i in range(40):
+        ahead, moved = 2.7 + 0.002 * i, 0.03 * math.sin(0.4 * i) + dice.gauss(0.0, 0.01)
+        c, s = math.cos(ahead), math.sin(ahead)
+        report = Information.none().add((c, s, 0.0), c * moved, 0.002**2)
+        report = report.add((-s, c, 0.0), -s * moved, 0.11**2)
+        raw = raw.with_report(i * SECOND // 10, FADING_NS, report)
+        sums = sums.with_report(i * SECOND // 10, FADING_NS, with_position_error(report, error))
+    mean, without = sums.mean(0.01), raw.mean(0.01)
+    assert mean is not None
+    assert without is not None
+    assert mean.covariance.mahalanobis_squared(mean.x, mean.y) < 9.0
+    assert without.covariance.mahalanobis_squared(without.x, without.y) > 13.8  # without it
 
 
 # Comparisons --------------------------------------------------------------------------------------

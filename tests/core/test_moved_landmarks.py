@@ -16,6 +16,7 @@ from support.core import (
     position_error,
 )
 
+from cpcbl_team.camera_errors import NO_ERRORS
 from cpcbl_team.common_errors import CommonErrors
 from cpcbl_team.config import Field, Landmark, SensorSettings, Start, Unsurveyed
 from cpcbl_team.estimate import Estimate
@@ -38,7 +39,7 @@ from cpcbl_team.state import State
 
 PLACES = {"ne": (4.0, 3.0), "nw": (-1.0, 3.0), "sw": (-1.0, -2.0), "se": (4.0, -2.0)}
 TRUE = Field(landmarks={n: Landmark(x_m=x, y_m=y) for n, (x, y) in PLACES.items()})
-NO_CAMERA = CommonErrors.of_camera(0.0, Covariance2(0.0, 0.0, 0.0))
+NO_CAMERA = CommonErrors.of_camera(0.0, NO_ERRORS)
 
 
 def mapping_robot() -> Localizer:

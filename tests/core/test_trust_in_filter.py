@@ -304,3 +304,16 @@ def test_an_old_belief_is_not_assessed() -> None:
     """Its robot may have turned since then."""
     _, state = watched(1.0, age_ns=1_000 * MS)
     assert state.memory.teammates.senders["mate"].reason is None
+
+
+def test_a_mean_is_no_more_certain_than_the_estimate_changes() -> None:
+    """A fix of a millimetre is evidence of no more than the position of the estimate, whose error
+    is another one at the next fix."""
+    drive = Drive({}, sees_landmarks=True, rounds=1)
+    now_ns, (x, y, _) = drive.state.stamp_ns, drive.state.estimate.pose
+    state = drive.robot.add_fix(drive.state, fix(x, y, now_ns, sensor_m=1e-3))
+    (record,) = [r for n, r in state.memory.teammates.senders.items() if n]
+    (xx, xy, yy, *_), _ = record.offsets[0].evidence
+    noise, before = np.linalg.inv([[xx, xy], [xy, yy]]), drive.state.estimate.covariance
+    assert noise[0, 0] > before.xx
+    assert noise[1, 1] > before.yy

@@ -29,8 +29,9 @@ from support.core import (
 )
 
 from cpcbl_team.augmented_update import AugmentedUpdate, Reading, estimated_of
+from cpcbl_team.camera_errors import NO_ERRORS
 from cpcbl_team.common_error_filter import common_error_filter
-from cpcbl_team.common_errors import CommonErrors
+from cpcbl_team.common_errors import CAMERA, CommonErrors
 from cpcbl_team.config import (
     Field,
     Gives,
@@ -74,7 +75,7 @@ def parameters_of(p: Matrix) -> Parameters:
 
 def common_of(p: Matrix) -> CommonErrors:
     """A camera, and one object."""
-    return CommonErrors(0.0, (0.0,) * (len(p) - 3), parameters_of(p), {"box": 2})
+    return CommonErrors(0.0, (0.0,) * (len(p) - 3), parameters_of(p), {"box": CAMERA})
 
 
 def full(common: CommonErrors) -> Matrix:
@@ -101,12 +102,12 @@ def test_residuals_follow_the_error_of_a_place(name: str, pose: Pose2) -> None:
         return np.array([c.residual for c in constraints_of(pose, m, POSE, JOINT)])
 
     derivatives = [(residuals(STEP * e) - residuals(-STEP * e)) / (2 * STEP) for e in np.eye(2)]
-    common = common_of(np.eye(7))._replace(objects={name: 2})
+    common = common_of(np.eye(8))._replace(objects={name: CAMERA})
     seen = frame(pose, 0, field, [name]).sightings[0]
     m = measurement_of(seen, 0, pose, field, {}, SETTINGS, common)
     assert m is not None
     found = sensitivities_of(m, constraints_of(pose, m, POSE, JOINT), common)
-    of_object = [[dict(sensitivity)[i] for sensitivity in found] for i in (2, 3)]
+    of_object = [[dict(sensitivity)[i] for sensitivity in found] for i in (CAMERA, CAMERA + 1)]
     assert of_object == [pytest.approx(d.tolist(), abs=1e-6) for d in derivatives]
 
 
@@ -143,7 +144,7 @@ def test_an_update_estimates_some_errors_and_considers_the_others(
 def test_a_new_place_is_as_uncertain_as_what_it_was_seen_from() -> None:
     """Its covariance, also that with the pose and with all other errors, is J P J^T."""
     rng = np.random.default_rng(7)
-    p = random_matrix(rng, 7) * 0.01
+    p = random_matrix(rng, 8) * 0.01
     pose, place = Pose2(1.0, 2.0, 0.7), Gaussian2(2.0, 0.5, Covariance2(0.01, 0.002, 0.02))
     common = common_of(p)
     after = common.with_place("new", Estimate(pose, covariance3(p[:3, :3])), place)
@@ -151,21 +152,21 @@ def test_a_new_place_is_as_uncertain_as_what_it_was_seen_from() -> None:
     def at(e: Matrix) -> Matrix:
         """The place by a pose and a camera with these errors."""
         own = Pose2(pose.x + e[0], pose.y + e[1], pose.heading + e[2])
-        depth, across = place.x * math.exp(e[4]), place.y
+        depth, across = place.x * math.exp(e[4]), place.y - e[5] * place.x
         angle = math.atan2(across, depth) - e[3]
         r = math.hypot(depth, across)
         return np.array(own.transform(r * math.cos(angle), r * math.sin(angle)))
 
-    unit = np.eye(7)
+    unit = np.eye(8)
     jacobian = np.array([(at(STEP * e) - at(-STEP * e)) / (2 * STEP) for e in unit]).T
     noise = matrix2(place.covariance.rotated(pose.heading))
     due = np.vstack([np.hstack([p, p @ jacobian.T]), np.hstack([jacobian @ p, np.zeros((2, 2))])])
-    due[7:, 7:] = jacobian @ p @ jacobian.T + noise
+    due[8:, 8:] = jacobian @ p @ jacobian.T + noise
     assert full(after) == pytest.approx(due[3:, 3:], abs=1e-7)
     assert np.array(after.parameters.with_pose) == pytest.approx(due[3:, :3], abs=1e-7)
     assert after.place_error("new") == pytest.approx(pose.transform(place.x, place.y))
     assert after.place_covariance("new") == pytest.approx(
-        (due[7, 7], due[7, 8], due[8, 8]), abs=1e-7
+        (due[8, 8], due[8, 9], due[9, 9]), abs=1e-7
     )
 
 
@@ -268,9 +269,9 @@ def test_places_are_estimated_from_when_they_are_first_seen() -> None:
 
 def test_sigmas_of_sightings_come_from_where_the_object_is_taken_to_be() -> None:
     """The share of a range is that of the expected one, by the place as it is estimated."""
-    common = CommonErrors.of_camera(0.0, Covariance2(0.0, 0.0, 0.0))
+    common = CommonErrors.of_camera(0.0, NO_ERRORS)
     common = common.with_object("box", Covariance2(1.0, 0.0, 1.0))
-    common = common._replace(values=(0.0, 0.0, 1.0, 0.0))
+    common = common._replace(values=(0.0, 0.0, 0.0, 1.0, 0.0))
     seen = point_sighting(Pose2(0.0, 0.0, 0.0), "box", 4.0, 1.0)
     m = measurement_of(seen, 0, Pose2(0.0, 0.0, 0.0), ONE, {}, SETTINGS, common)
     assert m is not None
@@ -286,7 +287,7 @@ def test_a_turn_of_everything_stays_unknown_however_much_is_corrected() -> None:
     So no update may make the variance along this turn smaller, wherever it moves the estimates."""
     rng = np.random.default_rng(5)
     pose, cov = Pose2(1.0, 2.0, 0.7), diagonal(1e-6, 0.2)
-    common = CommonErrors.of_camera(0.0, Covariance2(0.0, 0.0, 0.0))
+    common = CommonErrors.of_camera(0.0, NO_ERRORS)
     estimate = Estimate(pose, cov)
     for k in range(3):
         place = Gaussian2(2.0 + k, 0.5 - k, Covariance2(0.04, 0.0, 0.04))

@@ -90,5 +90,6 @@ def url(port: int) -> str:
 
 
 def calibrated(**settings: Any) -> CameraSettings:
-    """The settings of a camera whose yaw and focal length are known well."""
-    return CameraSettings(**{"yaw_sigma_deg": 0.1, "focal_share": 0.005, **settings})
+    """The settings of a camera whose yaw and lens are known well."""
+    known = {"yaw_sigma_deg": 0.1, "focal_share": 0.005, "centre_share": 0.005}
+    return CameraSettings(**{**known, **settings})

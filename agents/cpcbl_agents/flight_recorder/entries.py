@@ -62,6 +62,7 @@ class Detected(Entry, frozen=True, array_like=True, gc=False, tag="d"):
         float | None, ...
     ] = ()  # of each sighting by markers, which the bus leaves out
     annotated: bytes | None = None  # as on the bus; without its image, as a frame that was taken
+    per_centre: tuple[float, ...] = ()  # as `per_focal`; empty in older recordings
 
 
 class Answered(Entry, frozen=True, array_like=True, tag="a"):

@@ -341,7 +341,8 @@ class _RecordedDetection(Detection):
     def collect(self) -> Sequence[DetectedFrame]:
         results = self._detection.collect()
         for stamp_ns, sightings, annotated in results:
-            found, reason, per_focal = b"", "", tuple[float | None, ...]()
+            found, reason = b"", ""
+            per_focal, per_centre = tuple[float | None, ...](), tuple[float, ...]()
             if isinstance(sightings, str):
                 reason = sightings
             else:
@@ -350,10 +351,15 @@ class _RecordedDetection(Detection):
                     s.heading_per_focal if isinstance(s, MarkerSighting) else None
                     for s in sightings.sightings
                 )
+                per_centre = tuple(
+                    s.heading_per_centre if isinstance(s, MarkerSighting) else 0.0
+                    for s in sightings.sightings
+                )
             shown = None
             if annotated is not None:
                 key = topics.LOOK.at(robot=annotated.robot)
                 shown = self._recorder.without_image(key, encode(annotated))
             size = len(found) + len(shown or b"")
-            self._recorder.note(Detected(stamp_ns, found, reason, per_focal, shown), size)
+            entry = Detected(stamp_ns, found, reason, per_focal, shown, per_centre)
+            self._recorder.note(entry, size)
         return results

@@ -24,25 +24,52 @@ from cpcbl_team.motion import move
 
 Floats = NDArray[np.float64]
 
+YAW, FOCAL, CENTRE = range(3)  # of `CameraErrors`
 SOLVED_AT = 4, 6, 8, 12, 16, 24, 32
 """Numbers of keyframes in the window at which the errors are estimated; the last fills it."""
 LEAST_DISTANCE_M, LEAST_TURN_RAD, LEAST_NS = 0.1, 0.1, 1_000_000_000
-PRIOR = np.array([math.radians(5.0), 0.1, 0.1, 0.1])
-"""Sigmas of yaw, focal length, and scales of distance and turn, before any keyframe."""
-FADING = np.array([math.radians(0.1), 0.002, 0.01, 0.01])  # of a window: cameras are knocked
+PRIOR = np.array([math.radians(5.0), 0.1, 0.1, 0.1, 0.1])
+"""Sigmas of yaw, focal length, centre, and scales of distance and turn, before any keyframe."""
+FADING = np.array([math.radians(0.1), 0.002, 0.002, 0.01, 0.01])  # of a window: they are knocked
+CAMERA, ALL = 3, len(PRIOR)  # the errors of the camera come first
 GUESS_SIGMAS = np.array([1.0, 1.0, 0.5])  # m, m, rad: the filter's poses are nearly right
 STEPS, ROBUST_SIGMAS = 6, 2.5
 CONVERGED = 0.1  # the last change of the errors, in sigmas
-MOST_ERRORS = np.array([0.3, 0.3])  # rad, and of the logarithm: no camera is so wrong
+MOST_ERRORS = np.array([0.3, 0.3, 0.3])  # as in `CameraErrors`: no camera is so wrong
 MOST_SCATTER = 9.0  # a fit that is worse explains nothing
 LEAST_SIGMA = 1e-4  # m and rad, of a motion and of a start
 
 
 class Estimated(NamedTuple):
-    """The errors of a camera, with their sigmas."""
+    """The errors of a camera, and their covariance (3, 3)."""
 
     errors: CameraErrors
-    sigmas: CameraErrors
+    covariance: tuple[tuple[float, float, float], ...]
+
+    @property
+    def sigmas(self) -> CameraErrors:
+        return CameraErrors(*(math.sqrt(max(self.covariance[i][i], 0.0)) for i in range(CAMERA)))
+
+    @property
+    def turn_rad(self) -> float:
+        """What bearings in the middle of the image are too large by, by yaw and centre."""
+        return self.errors.yaw_rad + self.errors.centre
+
+    @property
+    def turn_sigma_rad(self) -> float:
+        c = self.covariance
+        return math.sqrt(max(c[YAW][YAW] + 2.0 * c[YAW][CENTRE] + c[CENTRE][CENTRE], 0.0))
+
+    def without(self, error: int) -> "Estimated":
+        """The estimate given that this error is none."""
+        c = self.covariance
+        gain = [row[error] / c[error][error] for row in c]
+        errors = [e - k * self.errors[error] for e, k in zip(self.errors, gain, strict=True)]
+        rows = [
+            (xx - k * c[error][0], xy - k * c[error][1], xz - k * c[error][2])
+            for (xx, xy, xz), k in zip(c, gain, strict=True)
+        ]
+        return Estimated(CameraErrors(*errors), tuple(rows))
 
 
 class _Keyframe(NamedTuple):
@@ -67,7 +94,7 @@ class CameraCheck:
         self._keyframes: list[_Keyframe] = []
         self._motion = Estimate(Pose2(0.0, 0.0, 0.0), ZERO3)
         self._last_ns = -LEAST_NS
-        self._mean: Floats = np.zeros(4)
+        self._mean: Floats = np.zeros(ALL)
         self._information: Floats = np.diag(PRIOR**-2.0)
         self.estimated: Estimated | None = None
 
@@ -95,8 +122,8 @@ class CameraCheck:
             return False
         mean, covariance = solved
         self.estimated = Estimated(
-            CameraErrors(*map(float, mean[:2])),
-            CameraErrors(*map(float, np.sqrt(np.diag(covariance))[:2])),
+            CameraErrors(*mean[:CAMERA].tolist()),
+            tuple(map(tuple, covariance[:CAMERA, :CAMERA].tolist())),
         )
         if number == SOLVED_AT[-1]:
             faded = np.linalg.inv(covariance + np.diag(FADING**2.0))
@@ -112,8 +139,8 @@ class CameraCheck:
         return *place, s.bearing_rad, s.bearing_sigma_rad, s.range_m, s.range_sigma_m
 
     def _solve(self) -> tuple[Floats, Floats] | None:
-        """Mean and covariance of yaw, focal length, and the scales of distance and turn; None if
-        the fit does not converge, or explains nothing."""
+        """Mean and covariance of yaw, focal length, centre, and the scales of distance and turn;
+        None if the fit does not converge, or explains nothing."""
         number = len(self._keyframes)
         guesses = np.array([k.guess for k in self._keyframes]).ravel()
         x = np.concatenate([guesses, self._mean])
@@ -129,18 +156,19 @@ class CameraCheck:
             j, e = np.concatenate([j1 * weights[:, None], j2]), np.concatenate([e1 * weights, e2])
             normal, vector = j.T @ j, j.T @ e
             normal[range(3 * number), range(3 * number)] += of_guesses
-            vector[:-4] += of_guesses * (guesses - x[:-4])
-            normal[-4:, -4:] += self._information
-            vector[-4:] += self._information @ (self._mean - x[-4:])
+            vector[:-ALL] += of_guesses * (guesses - x[:-ALL])
+            normal[-ALL:, -ALL:] += self._information
+            vector[-ALL:] += self._information @ (self._mean - x[-ALL:])
             self._add_start(x, normal, vector)
             change = np.linalg.solve(normal, vector)
             x = x + change
-        covariance = np.linalg.inv(normal)[-4:, -4:]
+        covariance = np.linalg.inv(normal)[-ALL:, -ALL:]
         scatter = float(e @ e) / max(len(e) - 3 * number, 1)
-        has_converged = np.all(np.abs(change[-4:]) < CONVERGED * np.sqrt(np.diag(covariance)))
-        if not has_converged or scatter > MOST_SCATTER or np.any(np.abs(x[-4:-2]) > MOST_ERRORS):
+        has_converged = np.all(np.abs(change[-ALL:]) < CONVERGED * np.sqrt(np.diag(covariance)))
+        errors, is_possible = x[-ALL:], np.all(np.abs(x[-ALL:][:CAMERA]) <= MOST_ERRORS)
+        if not has_converged or scatter > MOST_SCATTER or not is_possible:
             return None
-        return x[-4:], max(1.0, scatter) * covariance
+        return errors, max(1.0, scatter) * covariance
 
     def _add_start(self, x: Floats, normal: Floats, vector: Floats) -> None:
         s = self._start
@@ -157,22 +185,25 @@ class CameraCheck:
         self, x: Floats, seen: Floats, of_frame: NDArray[np.intp]
     ) -> tuple[Floats, Floats]:
         """The whitened residuals of bearings and ranges, and their Jacobian."""
-        yaw, focal = x[-4], x[-3]
-        px, py, heading = (x[:-4].reshape(-1, 3)[of_frame, i] for i in range(3))
+        yaw, focal, centre = x[-ALL:][:CAMERA]
+        px, py, heading = (x[:-ALL].reshape(-1, 3)[of_frame, i] for i in range(3))
         dx, dy = seen[:, 0] - px, seen[:, 1] - py
         distance = np.hypot(dx, dy)
         off_axis = np.arctan2(dy, dx) - heading - self._axis + yaw
-        depth, across = distance * np.cos(off_axis) * np.exp(-focal), distance * np.sin(off_axis)
+        depth = distance * np.cos(off_axis) * np.exp(-focal)
+        across = distance * np.sin(off_axis) + centre * depth
         read = np.hypot(depth, across)
         bearing = np.arctan2(across, depth) + self._axis
-        # derivatives of depth and across by distance, angle and focal length
-        d_depth = np.stack([depth / distance, -across * np.exp(-focal), -depth])
-        d_across = np.stack([across / distance, distance * np.cos(off_axis), np.zeros_like(depth)])
+        # derivatives of depth and across by distance, angle, focal length and centre
+        turned = -distance * np.sin(off_axis) * np.exp(-focal)
+        d_depth = np.stack([depth / distance, turned, -depth, np.zeros_like(depth)])
+        turned = distance * np.cos(off_axis) + centre * turned
+        d_across = np.stack([across / distance, turned, -centre * depth, depth])
         d_range = (depth * d_depth + across * d_across) / read
         d_bearing = (depth * d_across - across * d_depth) / read**2
         size, rows = len(x), np.arange(len(seen))
         parts = []
-        for residual, (by_distance, by_angle, by_focal), sigma in (
+        for residual, (by_distance, by_angle, by_focal, by_centre), sigma in (
             (wrap_angles(seen[:, 2] - bearing), d_bearing, seen[:, 3]),
             (seen[:, 4] - read, d_range, seen[:, 5]),
         ):
@@ -181,7 +212,7 @@ class CameraCheck:
             j[rows, 3 * of_frame] = -by_distance * c + by_angle * s / distance
             j[rows, 3 * of_frame + 1] = -by_distance * s - by_angle * c / distance
             j[rows, 3 * of_frame + 2] = -by_angle
-            j[:, -4], j[:, -3] = by_angle, by_focal
+            j[:, -ALL], j[:, 1 - ALL], j[:, 2 - ALL] = by_angle, by_focal, by_centre
             known = np.isfinite(residual)
             parts.append(((residual / sigma)[known], (j / sigma[:, None])[known]))
         (e1, j1), (e2, j2) = parts
@@ -190,7 +221,7 @@ class CameraCheck:
 
 def _motion_errors(x: Floats, motions: Floats, whiteners: Floats) -> tuple[Floats, Floats]:
     """The whitened residuals of the odometry between keyframes, and their Jacobian."""
-    poses = x[:-4].reshape(-1, 3)
+    poses = x[:-ALL].reshape(-1, 3)
     before, after, number = poses[:-1], poses[1:], len(motions)
     c, s = np.cos(before[:, 2]), np.sin(before[:, 2])
     dx, dy = after[:, 0] - before[:, 0], after[:, 1] - before[:, 1]

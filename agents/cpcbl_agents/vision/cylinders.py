@@ -177,14 +177,16 @@ class CylinderDetector:
     def _sighting(self, name: str, fit: CylinderFit) -> Sighting:
         """Range and bearing from the robot's centre; the bearing only if something is hidden."""
         s, outline, azimuth = self._settings, fit.outline, fit.outline.azimuth
-        oblique = s.focal_share * math.sin(azimuth) * math.cos(azimuth)
+        sine, cosine = math.sin(azimuth), math.cos(azimuth)
+        oblique = math.hypot(s.focal_share * sine, s.centre_share * cosine) * cosine
         leans = (s.roll_sigma_deg, s.tilt_sigma_deg * math.sin(azimuth))
         leaning = math.radians(math.hypot(*leans)) * outline.angles[MID]
         azimuth_sigma = math.hypot(outline.sigmas[WIDTH], oblique, leaning)
         if fit.hidden == WIDTH:  # the axis is within the radius of the middle of what is seen
             azimuth_sigma += fit.half_width
         narrow = NARROW_PX * self._panorama.step / max(2.0 * outline.angles[WIDTH], 1e-6)
-        range_sigma = math.hypot(fit.sigma * (1.0 + narrow * narrow), s.focal_share * fit.distance)
+        of_camera = math.hypot(s.focal_share, s.centre_share * sine * cosine) * fit.distance
+        range_sigma = math.hypot(fit.sigma * (1.0 + narrow * narrow), of_camera)
         bearing = self._panorama.bearing(azimuth)
         from_lens = PolarPosition(fit.distance, bearing, range_sigma, azimuth_sigma)
         seen = from_robot_centre((s.x_m, s.y_m), from_lens)

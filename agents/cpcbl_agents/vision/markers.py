@@ -263,9 +263,9 @@ def sighting(name: str, fit: PoseFit) -> Sighting:
     if heading_sigma > CLEAR_RAD:
         return Sighting(name, range_m, bearing, range_sigma, bearing_sigma)
     read = name, range_m, bearing, range_sigma, bearing_sigma, heading, heading_sigma
-    if fit.heading_per_focal is None:
+    if fit.heading_by_lens is None:
         return Sighting(*read)
-    return MarkerSighting(*read, fit.heading_per_focal)
+    return MarkerSighting(*read, *fit.heading_by_lens)
 
 
 def _framed_quads(grey: Pixels, quads: Floats, cells: int) -> Floats:

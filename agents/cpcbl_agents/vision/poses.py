@@ -62,15 +62,15 @@ class Lean(NamedTuple):
 class PoseFit(NamedTuple):
     """`viewer_from_mate`, its covariance (3, 3; m, rad), the mean squared error in sigmas (infinite
     if no pose fits at all), the lean of the camera which that pose implies, the variance of the
-    corners, as a multiple of the stated one, and the derivative (rad) of the heading by the
-    logarithm of the true focal length over the stated one; None where it is not linear."""
+    corners, as a multiple of the stated one, and the derivatives (rad) of the heading by the errors
+    of focal length and centre (`CameraErrors`); None where they are not linear."""
 
     pose: Pose2
     covariance: Floats
     misfit: float
     lean: Lean
     corner_variance: float
-    heading_per_focal: float | None = None
+    heading_by_lens: tuple[float, float] | None = None
 
 
 def side_corners(side: Side, vision: VisionSettings) -> Floats:
@@ -137,17 +137,17 @@ def _fit(
     covariances *= inflation
     headings = np.sqrt(covariances[:, 2, 2])
     mean, covariance = poses[best], covariances[best]
-    per_focal: float | None = view.heading_per_focal(poses[best])
+    by_lens: tuple[float, float] | None = view.heading_by_lens(poses[best])
     if headings[best] > NARROW or np.ptp(_wrap(poses[possible, 2] - mean[2])) > NARROW:
         pivot = shape[:4, :2].mean(axis=0)
         mean, covariance = _average_over_headings(
             poses[possible], headings[possible], pivot, view, inflation
         )
-        per_focal = None
+        by_lens = None
     x, y, heading = mean.tolist()
     pose = Pose2(x, y, wrap_angle(heading))
     lean = view.lean(poses[best])
-    return PoseFit(pose, covariance, misfit, lean, misfit * corner_variance, per_focal)
+    return PoseFit(pose, covariance, misfit, lean, misfit * corner_variance, by_lens)
 
 
 def _inverse(matrices: Floats) -> Floats:
@@ -166,11 +166,13 @@ def _corner_covariance(
     plane: Floats, s: CameraSettings, own_px: float, lean_errors: Floats
 ) -> Floats:
     """The covariance (2n, 2n) of corners (n, 2) on the plane z = 1. Each corner has an independent
-    error `own_px`; the errors of tilt, roll, yaw and focal length are common to all corners."""
+    error `own_px`; those of tilt, roll, yaw, focal length and principal point are common to all."""
     u, v = plane[:, 0], plane[:, 1]
     own = own_px / np.array([s.fx_px, s.fy_px])
     yaw = math.radians(s.yaw_sigma_deg) * np.stack([1.0 + u * u, u * v], axis=1)
-    common = np.concatenate([np.stack([yaw, s.focal_share * plane]).reshape(2, -1), lean_errors])
+    centre = np.tile([s.centre_share, 0.0], (len(plane), 1))
+    of_lens = np.stack([yaw, s.focal_share * plane, centre]).reshape(3, -1)
+    common = np.concatenate([of_lens, lean_errors])
     return np.asarray(np.diag(np.tile(own * own, len(plane))) + common.T @ common)
 
 
@@ -215,6 +217,7 @@ class _Reprojection:
         across = np.outer(ahead, axes[1]) - np.outer(aside, axes[0])
         self._rotated_point = np.stack([along.ravel(), across.ravel()])
         self._axes = axes[:2].copy()
+        self._left = np.array([axes[2, 1], -axes[2, 0]]) / max(math.hypot(*axes[2, :2]), 1e-9)
 
     def normal_equations(self, poses: Floats) -> Floats:
         """The products J' W J (k, 4, 4) for poses (k, 3).
@@ -233,12 +236,15 @@ class _Reprojection:
         tilt, roll = self._lean_errors @ self._weights @ errors
         return Lean(float(tilt) * self._sigmas.tilt, float(roll) * self._sigmas.roll)
 
-    def heading_per_focal(self, pose: Floats) -> float:
-        """The derivative of the heading by the logarithm of the focal length, at a pose (3,): a
-        longer lens moves the corners away from the optical axis, in proportion."""
+    def heading_by_lens(self, pose: Floats) -> tuple[float, float]:
+        """The derivatives of the heading by the errors of focal length and centre, at a pose (3,):
+        a longer lens moves the corners away from the optical axis, in proportion; another centre
+        moves all of them by the same, in the direction that is left on the floor."""
         jacobian = self._derivatives(pose[None])[0, :, :3]
         weighted = jacobian.T @ self._weights
-        return float(np.linalg.solve(weighted @ jacobian, weighted @ self._plane.ravel())[2])
+        moved = np.stack([self._plane.ravel(), np.tile(self._left, len(self._plane))], axis=1)
+        focal, centre = np.linalg.solve(weighted @ jacobian, weighted @ moved)[2]
+        return float(focal), float(centre)
 
     def _derivatives(self, poses: Floats) -> Floats:
         """The matrices J (k, 2n, 4)."""

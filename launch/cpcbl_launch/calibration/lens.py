@@ -200,6 +200,12 @@ class LensCalibration(msgspec.Struct, frozen=True):
     pictures: tuple[PictureResult, ...]
     notes: tuple[str, ...] = ()
 
+    @property
+    def centre_share(self) -> float:
+        """The accuracy of `cx_px`, as a share of the focal length."""
+        deviation = self.intrinsics["cx_px"].standard_error / self.intrinsics["fx_px"].value
+        return max(deviation, MIN_FOCAL_SHARE)
+
 
 class Residuals(NamedTuple):
     """Pixels of the corners (n, 2), and their errors, found minus expected (n, 2); px."""

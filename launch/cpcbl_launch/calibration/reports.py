@@ -95,6 +95,7 @@ def print_lens(lens: LensCalibration, console: Console) -> None:
         values.add_row(name, *format_estimate(estimate).split(" ± "))
     values.add_section()
     values.add_row("focal_share", f"{lens.focal_share:.4f}", "")
+    values.add_row("centre_share", f"{lens.centre_share:.4f}", "")
     values.add_row("covered", percent(lens.covered), "")
     console.print(values)
     _print_notes(lens.notes, console)

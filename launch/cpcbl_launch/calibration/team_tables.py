@@ -27,6 +27,7 @@ CAMERA_SIGMAS = (
     "roll_sigma_deg",
     "yaw_sigma_deg",
     "focal_share",
+    "centre_share",
 )
 UNSURVEYED = {"landmarks": "unsurveyed", "walls": "unsurveyed_walls"}
 MAX_SIGMA_ERROR = 0.1  # stated sigmas that differ from the errors by less stay
@@ -203,6 +204,7 @@ def camera_table(lens: LensCalibration) -> dict[str, TomlValue]:
             ", ".join(item.remark or "not determined" for item in distortion),
         ),
         "focal_share": TomlValue(round(lens.focal_share, 4)),
+        "centre_share": TomlValue(round(lens.centre_share, 4)),
     }
 
 

@@ -357,8 +357,11 @@ def _sightings_of(found: Detected) -> Sightings:
     """The sightings in a frame as the detector made them."""
     frame = decode_tagged(found.sightings)
     assert isinstance(frame, Sightings)
+    per_centre = found.per_centre or (0.0,) * len(found.per_focal)
     sightings = (
-        sighting if k is None else MarkerSighting(**asdict(sighting), heading_per_focal=k)
-        for sighting, k in zip(frame.sightings, found.per_focal, strict=True)
+        sighting
+        if k is None
+        else MarkerSighting(**asdict(sighting), heading_per_focal=k, heading_per_centre=c)
+        for sighting, k, c in zip(frame.sightings, found.per_focal, per_centre, strict=True)
     )
     return Sightings(frame.stamp_ns, tuple(sightings))

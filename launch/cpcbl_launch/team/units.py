@@ -71,6 +71,7 @@ USUAL = {
     "camera.roll_sigma_deg": Usual(0.005, 20.0),
     "camera.yaw_sigma_deg": Usual(0.0, 20.0),
     "camera.focal_share": Usual(0.0, 0.3, SHARE),
+    "camera.centre_share": Usual(0.0, 0.3, SHARE),
     "trust.readmit_s": Usual(0.0, 600.0, TIME),
     "trust.least_sigma_m": Usual(0.0, 1.0, LENGTH),
     "trust.guest_sigma_m": Usual(0.0, 1.0, LENGTH),

@@ -25,7 +25,6 @@ from cpcbl_team.geometry import Pose2, step, wrap_angle
 from cpcbl_team.inputs import InputsMended, Odometry, Sighting, Sightings
 
 STEP_NS = 250_000_000
-HALF_VIEW_RAD = math.radians(39.0)
 NOISE = OdometrySettings(
     distance_sigma_m_per_sqrt_m=0.05,
     turn_sigma_rad_per_sqrt_rad=0.05,
@@ -34,6 +33,7 @@ NOISE = OdometrySettings(
 FOUR = {"sw": (0.0, 0.0), "se": (6.0, 0.0), "ne": (6.0, 4.0), "nw": (0.0, 4.0)}
 SIX = {**FOUR, "s": (3.0, 0.0), "n": (3.0, 4.0)}
 YAW, FOCAL = CameraErrors(math.radians(3.0), 0.0), CameraErrors(0.0, 0.05)
+CENTRE = CameraErrors(0.0, 0.0, 0.05)
 
 
 class Drive(NamedTuple):
@@ -48,20 +48,19 @@ class Drive(NamedTuple):
     corrects: bool = True
     has_exact_start: bool = False
     misplaced: str = ""
-    stated: tuple[float, float] = (
-        0.0,
-        0.0,
-    )  # sigmas of yaw (deg) and focal length; then the filter
-    # knows of these errors
+    half_view_deg: float = 39.0
+    stated: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Sigmas of yaw (deg), focal length and centre; then the filter knows of these errors."""
 
 
 def correction_of(drive: Drive) -> CameraCorrection:
-    yaw_sigma_deg, focal_share = drive.stated
+    yaw_sigma_deg, focal_share, centre_share = drive.stated
     camera = CameraSettings(
         yaw_deg=math.degrees(drive.axis_rad),
         self_calibration=drive.corrects,
         yaw_sigma_deg=yaw_sigma_deg,
         focal_share=focal_share,
+        centre_share=centre_share,
     )
     sigmas = (0.0, 0.0) if drive.has_exact_start else (0.02, 0.3)
     start = Start(x_m=3.0, y_m=2.0, sigma_m=sigmas[0], heading_sigma_deg=sigmas[1])
@@ -74,7 +73,8 @@ def correction_of(drive: Drive) -> CameraCorrection:
 def read_by(true: Sighting, errors: CameraErrors, axis_rad: float) -> Sighting:
     """What a camera with these errors reads in place of a sighting."""
     turned = replace(true, bearing_rad=wrap_angle((true.bearing_rad or 0.0) + errors.yaw_rad))
-    return without_errors(turned, CameraErrors(0.0, -errors.focal), axis_rad)
+    magnified = without_errors(turned, CameraErrors(0.0, -errors.focal), axis_rad)
+    return without_errors(magnified, CameraErrors(0.0, 0.0, -errors.centre), axis_rad)
 
 
 def frame_at(pose: Pose2, drive: Drive, random: np.random.Generator) -> tuple[Sighting, ...]:
@@ -83,7 +83,7 @@ def frame_at(pose: Pose2, drive: Drive, random: np.random.Generator) -> tuple[Si
         if name == drive.misplaced:
             x += 0.5
         r, b = math.hypot(x - pose.x, y - pose.y), math.atan2(y - pose.y, x - pose.x) - pose.heading
-        if abs(wrap_angle(b - drive.axis_rad)) > HALF_VIEW_RAD:
+        if abs(wrap_angle(b - drive.axis_rad)) > math.radians(drive.half_view_deg):
             continue
         sigma_r, sigma_b = 0.01 * r, math.radians(0.3)
         noisy = r + sigma_r * random.normal(), wrap_angle(b + sigma_b * random.normal())
@@ -152,23 +152,30 @@ def test_a_longer_lens_makes_things_look_nearer_and_wider_apart() -> None:
         Drive(YAW, moves=False),
         Drive(FOCAL, moves=False),
         Drive(YAW, moves=False, has_exact_start=True),
+        Drive(CENTRE),
+        Drive(CENTRE, FOUR),
+        Drive(CameraErrors(0.0, 0.05, -0.05)),
+        Drive(CENTRE, moves=False),
     ],
     ids=str,
 )
 def test_a_wrong_camera_is_named_and_its_errors_are_found(drive: Drive, seed: int) -> None:
     correction, changes = run(drive, seed)
-    found, sigmas = correction.found  # type: ignore[misc]
-    for name in ("yaw_rad", "focal"):
+    assert correction.found is not None
+    found, sigmas = correction.found.errors, correction.found.sigmas
+    for name in CameraErrors._fields:
         error = getattr(found, name) - getattr(drive.errors, name)
-        assert abs(error) < 3.5 * getattr(sigmas, name)
-    assert found.yaw_rad == pytest.approx(drive.errors.yaw_rad, abs=math.radians(1.0))
+        assert abs(error) <= 3.5 * getattr(sigmas, name)
+    assert found.yaw_rad == pytest.approx(drive.errors.yaw_rad, abs=math.radians(1.5))
     assert found.focal == pytest.approx(drive.errors.focal, abs=0.01)
     assert correction.counts["camera_miscalibrated"] == 1
     (problem,) = correction.problems
     assert ("`yaw_deg`" in problem) is (drive.errors.yaw_rad != 0.0)
     assert ("`fx_px`" in problem) is (drive.errors.focal != 0.0)
+    assert ("`cx_px`" in problem) is (drive.errors.centre != 0.0)
     turned = sum(change.turn_rad for change in changes)
-    assert turned == pytest.approx(drive.errors.yaw_rad, abs=math.radians(1.0))
+    due = drive.errors.yaw_rad + drive.errors.centre
+    assert turned == pytest.approx(due, abs=math.radians(1.0))
 
 
 @pytest.mark.parametrize(
@@ -196,7 +203,7 @@ def test_a_right_camera_is_not_blamed(drive: Drive) -> None:
 def test_an_error_that_the_filter_reckons_with_is_named_and_left_to_it(
     errors: CameraErrors,
 ) -> None:
-    correction, changes = run(Drive(errors, stated=(2.0, 0.025)))
+    correction, changes = run(Drive(errors, stated=(2.0, 0.025, 0.025)))
     assert correction.counts["camera_miscalibrated"] == 1
     assert not changes
     read = Sighting("ne", 3.0, 0.3, 0.03, 0.005)
@@ -206,7 +213,7 @@ def test_an_error_that_the_filter_reckons_with_is_named_and_left_to_it(
 
 @pytest.mark.parametrize("errors", [YAW, FOCAL], ids=str)
 def test_an_error_of_many_sigmas_is_corrected(errors: CameraErrors) -> None:
-    _, changes = run(Drive(errors, stated=(0.1, 0.005)))
+    _, changes = run(Drive(errors, stated=(0.1, 0.005, 0.005)))
     assert sum(c.turn_rad for c in changes) == pytest.approx(errors.yaw_rad, abs=math.radians(1.0))
     assert changes
 
@@ -229,6 +236,28 @@ def test_with_the_key_false_it_is_named_and_nothing_is_changed() -> None:
     read = Sighting("ne", 3.0, 0.3, 0.03, 0.005)
     frame, _ = correction.correct(Sightings(10**12, (read,)))
     assert frame.sightings == (read,)
+
+
+@pytest.mark.parametrize("errors", [YAW, CENTRE], ids=str)
+def test_a_narrow_view_does_not_tell_the_yaw_from_the_principal_point(errors: CameraErrors) -> None:
+    for seed in range(3):
+        correction, changes = run(Drive(errors, half_view_deg=6.0, seconds=120.0), seed)
+        (problem,) = correction.problems
+        assert "its `yaw_deg` is wrong, or its `cx_px` by" in problem
+        turned = sum(change.turn_rad for change in changes)
+        due = errors.yaw_rad + errors.centre
+        assert turned == pytest.approx(due, abs=math.radians(1.0))
+
+
+@pytest.mark.parametrize("errors", [YAW, CENTRE, CameraErrors(-YAW.yaw_rad, 0.0, 0.05)], ids=str)
+@pytest.mark.parametrize("half_view_deg", [6.0, 10.0, 15.0, 39.0])
+def test_what_is_named_is_never_the_wrong_one(errors: CameraErrors, half_view_deg: float) -> None:
+    for seed in range(2):
+        correction, _ = run(Drive(errors, half_view_deg=half_view_deg, seconds=60.0), seed)
+        for problem in correction.problems:
+            if "or its `cx_px`" not in problem:
+                assert ("`yaw_deg`" in problem) <= (errors.yaw_rad != 0.0)
+                assert ("`cx_px`" in problem) <= (errors.centre != 0.0)
 
 
 def test_one_landmark_that_stands_elsewhere_does_not_blame_the_camera() -> None:

@@ -87,7 +87,7 @@ def test_teammates_within_three_metres_are_found_placed_and_their_headings_told(
 def test_sigmas_hold_with_a_camera_that_is_not_quite_as_calibrated() -> None:
     random, sigmas = np.random.default_rng(3), []
     for seed in range(30):
-        tilt, yaw, focal = random.standard_normal(3)
+        tilt, yaw, focal, centre = random.standard_normal(4)
         stretch = 1.0 + focal * CAMERA.focal_share
         true = replace(
             CAMERA,
@@ -95,6 +95,7 @@ def test_sigmas_hold_with_a_camera_that_is_not_quite_as_calibrated() -> None:
             yaw_deg=float(yaw * CAMERA.yaw_sigma_deg),
             fx_px=float(CAMERA.fx_px * stretch),
             fy_px=float(CAMERA.fy_px * stretch),
+            cx_px=float(CAMERA.cx_px + CAMERA.fx_px * centre * CAMERA.centre_share),
         )
         robots = {robot.name: robot for robot in three(random)}
         detections = looked(TEAM, picture(TEAM, list(robots.values()), true, seed=seed))

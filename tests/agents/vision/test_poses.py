@@ -70,7 +70,9 @@ def test_exact_corners_tell_the_pose(
     ("range_m", "turn_deg"), [(1.0, 35.0), (2.0, 10.0), (2.0, 50.0), (3.5, 30.0)]
 )
 def test_three_sigma_hold_what_noise_does(range_m: float, turn_deg: float) -> None:
-    settings = replace(CAMERAS[0], tilt_sigma_deg=0.01, yaw_sigma_deg=0.01, focal_share=1e-4)
+    settings = replace(
+        CAMERAS[0], tilt_sigma_deg=0.01, yaw_sigma_deg=0.01, focal_share=1e-4, centre_share=1e-4
+    )
     camera, random = Camera(settings), np.random.default_rng(8)
     robot = Pose2(range_m, 0.1, math.pi + math.radians(turn_deg))
     exact = camera.project(seen_at(robot, "front", VISION))
@@ -93,13 +95,31 @@ def test_corners_that_no_pose_shows_are_misfits() -> None:
     assert fit_pose({"front": bent}, VISION, camera).misfit > 20.0
 
 
-@pytest.mark.parametrize("share", [0.95, 1.05])
+@pytest.mark.parametrize(
+    "errors",
+    [
+        *(CameraErrors(0.0, math.log(share)) for share in (0.95, 1.05)),
+        *(CameraErrors(0.0, 0.0, centre) for centre in (0.05, -0.05)),
+    ],
+    ids=str,
+)
+@pytest.mark.parametrize("roll_deg", [0.0, 180.0])
 @pytest.mark.parametrize(("bearing_deg", "heading_deg"), [(45.0, 0.0), (30.0, 70.0), (-26.0, 40.0)])
-def test_a_heading_that_a_wrong_focal_length_turned_is_corrected(
-    share: float, bearing_deg: float, heading_deg: float
+def test_a_heading_that_a_wrong_lens_turned_is_corrected(
+    errors: CameraErrors, roll_deg: float, bearing_deg: float, heading_deg: float
 ) -> None:
-    stated = calibrated(yaw_sigma_deg=0.0, focal_share=0.0)
-    built = Camera(replace(stated, fx_px=share * stated.fx_px, fy_px=share * stated.fy_px))
+    stated = calibrated(yaw_sigma_deg=0.0, focal_share=0.0, centre_share=0.0, roll_deg=roll_deg)
+    share, px = math.exp(errors.focal), stated.fx_px * errors.centre
+    roll = math.radians(roll_deg)
+    built = Camera(
+        replace(
+            stated,
+            fx_px=share * stated.fx_px,
+            fy_px=share * stated.fy_px,
+            cx_px=stated.cx_px - px * math.cos(roll),
+            cy_px=stated.cy_px + px * math.sin(roll),
+        )
+    )
     camera, bearing = Camera(stated), math.radians(bearing_deg)
     robot = Pose2(2.0 * math.cos(bearing), 2.0 * math.sin(bearing), math.radians(heading_deg))
     seen = {
@@ -108,7 +128,7 @@ def test_a_heading_that_a_wrong_focal_length_turned_is_corrected(
         if abs(facing(camera, robot, side)) < math.radians(65.0)
     }
     read = sighting("mate", fit_pose(seen, VISION, camera))
-    corrected = without_errors(read, CameraErrors(0.0, math.log(share)), 0.0)
+    corrected = without_errors(read, errors, 0.0)
     assert read.heading_rad is not None
     assert corrected.heading_rad is not None
     assert abs(wrap_angle(read.heading_rad - robot.heading)) > math.radians(0.3)

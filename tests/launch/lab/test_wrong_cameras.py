@@ -22,6 +22,7 @@ class Wrong(NamedTuple):
     focal: float = 0.0
     tilt_deg: float = 0.0
     roll_deg: float = 0.0
+    centre_px: float = 0.0
 
     def of(self, camera: CameraSettings) -> CameraSettings:
         return replace(
@@ -31,6 +32,7 @@ class Wrong(NamedTuple):
             yaw_deg=camera.yaw_deg + self.yaw_deg,
             tilt_deg=camera.tilt_deg + self.tilt_deg,
             roll_deg=camera.roll_deg + self.roll_deg,
+            cx_px=camera.cx_px + self.centre_px,
         )
 
 
@@ -40,6 +42,7 @@ KINDS = {
     "focal length": (FOCAL,) * 4,
     "a shorter focal length": (Wrong(focal=-0.05),) * 4,
     "tilt": (Wrong(tilt_deg=2.0, roll_deg=1.0),) * 4,
+    "principal point": (Wrong(centre_px=20.0),) * 4,
     "one robot": (RIGHT, YAW, RIGHT, RIGHT),
     "a mix": (Wrong(2.0, -0.03), Wrong(-3.0, 0.05, 1.0), Wrong(0.0, -0.05), Wrong(3.0, 0.0, -1.5)),
 }
@@ -59,6 +62,7 @@ def report_with(
 
     monkeypatch.setattr(cameras, "with_focal_error", focal)
     monkeypatch.setattr(cameras, "with_yaw_error", yaw)
+    monkeypatch.setattr(cameras, "with_centre_error", lambda camera, _, __: camera)
     report, _ = simulate(load_team(builtin_path("eyes")), seed, run_s)
     return report
 

@@ -6,7 +6,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 
@@ -80,6 +80,21 @@ class Driven:
         self._last_ns = now_ns
         return self._statuses[-1].counts if self._statuses else {}
 
+    def says(self, text: str, images: Sequence[bytes] = (), late_ns: int = 0) -> bool:
+        """Whether its status says this while it receives these images again and again, with stamps
+        that are so late."""
+
+        def is_said() -> bool:
+            for image in images:
+                self.frames.put(encode(Frame(time.time_ns() - late_ns, image)))
+                time.sleep(0.1)
+            self.counts()
+            return any(
+                text in problem for status in self._statuses[-1:] for problem in status.problems
+            )
+
+        return eventually(is_said, PATIENCE_S)
+
     def until(self, **counts: int) -> None:
         """Returns when it has counted so much."""
         assert eventually(lambda: counts.items() <= self.counts().items(), PATIENCE_S), (
@@ -141,6 +156,22 @@ def test_broken_frames_between_good_ones_are_counted_by_reason(tmp_path: Path) -
         assert robot.counted("odometry", before + 1)
         refused = {str(reason) for reason in Refusal} & robot.counts().keys()
         assert refused <= {"wrong_version"}  # unless the good frame was sooner at hand
+
+
+def test_a_camera_that_goes_wrong_is_said_in_one_line_and_the_robot_goes_on(
+    tmp_path: Path,
+) -> None:
+    bright, dark, other = good(8), jpeg(picture(8, (64, 48)) // 8), jpeg(picture(3, (128, 96)))
+    with driven(write_team(tmp_path)) as robot:
+        assert robot.says("the exposure of the camera jumped", (bright, dark))
+        assert robot.says("images do not have the size of `camera`", (good(1), other))
+        assert robot.says("images repeat the one before exactly", (bright, bright))
+        assert robot.says("behind this robot's clock", (good(2), good(3)), 5 * 10**9)
+        before = robot.counts()["sightings"]
+        assert robot.says("no frame on in/r1/frame")
+        robot.frames.put(encode(Frame(time.time_ns(), good(4))))
+        assert robot.counted("sightings", before + 1)
+        assert robot.counted("odometry", robot.counts()["odometry"] + 5)
 
 
 def hostile_frames() -> list[bytes]:

@@ -40,6 +40,7 @@ class Cameras:
         for i, name in enumerate(self._cameras):
             random = np.random.default_rng((seed, _SEED, i, 1))
             self._cameras[name] = with_yaw_error(self._cameras[name], self._noise, random)
+            self._cameras[name] = with_centre_error(self._cameras[name], self._noise, random)
         guards = team.transport.guards
         allowed = guards.largest_frame_bytes if guards.enabled else LARGEST_FRAME
         self._largest = min(allowed, LARGEST_FRAME) - HEAD_BYTES
@@ -68,6 +69,15 @@ def with_yaw_error(
     """The settings with a random error of the yaw that stays; its sigma is scaled by `noise`."""
     yaw = noise * camera.yaw_sigma_deg * float(random.normal())
     return replace(camera, yaw_deg=camera.yaw_deg + yaw, yaw_sigma_deg=0.0)
+
+
+def with_centre_error(
+    camera: CameraSettings, noise: float, random: np.random.Generator
+) -> CameraSettings:
+    """The settings with a random error of the principal point that stays; its sigma is scaled by
+    `noise`."""
+    share = noise * camera.centre_share * float(random.normal())
+    return replace(camera, cx_px=camera.cx_px + camera.fx_px * share)
 
 
 def with_mount_error(
