@@ -12,6 +12,7 @@ from cpcbl_team.estimate import (
     HEADING,
     POSE,
     POSITION,
+    WIDE_HEADING_RAD2,
     Covariance3,
     Estimate,
     Information,
@@ -26,6 +27,7 @@ from cpcbl_team.geometry import Pose2, wrap_angle
 from cpcbl_team.landmarks import LandmarkUpdate
 from cpcbl_team.measurements import GatedObject, combine
 from cpcbl_team.motion import NO_VARIANCE, MotionVariance, move
+from cpcbl_team.wide_headings import along_arc
 
 UpdateOrder = tuple[Scope | None, ...]
 
@@ -75,7 +77,8 @@ class JointVariant:
         """Steps 4 and 5: all evidence combined, then merged with the prior (equations 3 and 4).
         The observations of teammates follow one by one."""
         scope, evidence = self.scope(scope), landmarks.evidence.sums()
-        if not accepted:
+        bends = scope is POSE and prior.covariance.hh > WIDE_HEADING_RAD2
+        if not accepted and not bends:
             return self.merge(prior, evidence, scope)
         estimate = merge(prior, combine(Information.of(evidence), accepted), scope)
         for found in accepted:
@@ -87,7 +90,7 @@ class JointVariant:
                 observation = found.observation.shifted(dx, dy, turn)
                 by_teammate = bool(found.measurement.sender)
                 estimate = self.observe(estimate, observation, within, by_teammate)
-        return self.reduce(estimate)
+        return self.reduce(along_arc(prior, estimate) if bends else estimate)
 
     def observe(
         self, prior: Estimate, observation: Observation, scope: Scope, by_teammate: bool = True
