@@ -104,12 +104,26 @@ def contest_m(senders: SenderRecords, name: str) -> float:
 
 
 def compare(senders: SenderRecords, name: str, now_ns: int) -> Comparison | None:
-    """The result of test 3; None while the sender has no recent mean that is precise."""
+    """The result of test 3; None while the sender has no recent mean that is precise. A majority
+    decides a contest by both means: in one, the estimate may move fast, and means of a long time
+    differ by that where one sender reported more of late than another."""
     fast, slow = (_comparison_of(senders, name, now_ns, of) for of in (FAST, SLOW))
-    found = both(fast, slow) if fast is not None and slow is not None else fast or slow
+    found = fast or slow
+    if fast is not None and slow is not None:
+        found = both(fast, slow)
+        is_unanimous = fast.is_wrong == slow.is_wrong
+        if not is_unanimous and open_rivals(senders, name) and not _sees(senders, now_ns):
+            found = found._replace(is_wrong=False, is_contested=True)
     if wrong_turn(senders, name, now_ns) is None:
         return found
     return (found or Comparison())._replace(is_wrong=True, is_confirmed=False)
+
+
+def _sees(senders: SenderRecords, now_ns: int) -> bool:
+    """Whether the robot's own sensors have a recent mean that is precise."""
+    own = senders.get(OWN_SENSORS)
+    means = () if own is None else own.means
+    return any(m is not None and m.is_precise and now_ns - m.stamp_ns <= RECENT_NS for m in means)
 
 
 def _comparison_of(senders: SenderRecords, name: str, now_ns: int, of: int) -> Comparison | None:

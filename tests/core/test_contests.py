@@ -129,6 +129,23 @@ def test_a_sender_too_vague_to_take_a_side_ends_no_contest() -> None:
     assert rivals(after_reports(vague))["a"] == {"c"}
 
 
+def test_a_majority_decides_a_contest_by_both_means() -> None:
+    """Of a sender that reported less of late, the mean of a long time is that of another estimate:
+    a blind robot in a contest moved by 0.2 m, and quarantined a correct observer."""
+    senders = after_reports(TWO_AND_TWO)
+    late = replace(senders["a"], means=(says(0.0).means[0], says(-0.3).means[1]))
+    slow = {"b": 0.06, "c": 0.12, "d": 0.12}
+    others = {
+        n: replace(senders[n], means=(senders[n].means[0], says(x).means[1]))
+        for n, x in slow.items()
+    }
+    for own, is_wrong in ((None, False), (says(0.06, sigma=0.02), True)):
+        seen = {} if own is None else {OWN_SENSORS: own}
+        found = after_reports({**others, "a": late, **seen})["a"]
+        assert (found.wrong_ns > 0) is is_wrong
+    assert after_reports({**others, "a": replace(late, rivals=())})["a"].wrong_ns > 0
+
+
 def test_a_rival_whose_mean_is_no_longer_precise_is_none() -> None:
     """It reports, so nothing has to be remembered of it; a correct one seemed wrong once."""
     senders = after_reports({"a": says(0.0), "c": says(0.4, sigma=0.08)})
