@@ -207,6 +207,11 @@ def disagreement(one: MeanOffset, other: MeanOffset) -> float:
     return sum_.mahalanobis_squared(one.x - other.x, one.y - other.y)
 
 
+def contradicts(one: MeanOffset, other: MeanOffset) -> bool:
+    """Whether noise and usual errors of calibration do not explain the difference of two means."""
+    return disagreement(one, other) > CONFLICT
+
+
 def bias_variance(one: MeanOffset, other: MeanOffset) -> float:
     """The square of the bias (m^2) by which the noise of two means does not explain their
     difference."""
@@ -264,7 +269,7 @@ def compared_with_own_sensors(mean: MeanOffset, own: MeanOffset, others: Means) 
     """
     here = disagreement(mean, own)
     distances = [(other, disagreement(other, own)) for other in others.values()]
-    rivals = [there for other, there in distances if disagreement(mean, other) > CONFLICT]
+    rivals = [there for other, there in distances if contradicts(mean, other)]
     doubters = [other for other, there in distances if there - here <= NEARER]
     is_sure = own.is_within(SURE_SIGMA_M)
     if is_sure:
@@ -287,10 +292,10 @@ def compared_with_majority(mean: MeanOffset, others: Means) -> Comparison:
     needed = count // 2  # other means that make a strict majority with its own
     biases = sorted(bias_variance(mean, other) for other in others.values())
     bias = biases[needed - 1]
-    agreeing = sum(disagreement(mean, other) <= CONFLICT for other in others.values())
+    agreeing = sum(not contradicts(mean, other) for other in others.values())
     if agreeing >= needed:
         return Comparison(bias, is_confirmed=True)
-    accusers = {n: o for n, o in others.items() if disagreement(mean, o) > CONFLICT}
+    accusers = {n: o for n, o in others.items() if contradicts(mean, o)}
     is_wrong = any(2 * (_agreeing(name, accusers) + 1) > count for name in accusers)
     return Comparison(bias, is_wrong, not is_wrong)
 
@@ -298,4 +303,4 @@ def compared_with_majority(mean: MeanOffset, others: Means) -> Comparison:
 def _agreeing(name: str, others: Means) -> int:
     """How many of the others agree with this one of them."""
     mean = others[name]
-    return sum(disagreement(mean, other) <= CONFLICT for n, other in others.items() if n != name)
+    return sum(not contradicts(mean, other) for n, other in others.items() if n != name)

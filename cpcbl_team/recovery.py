@@ -11,7 +11,7 @@ from typing import Final, NamedTuple
 
 from cpcbl_team.config import Field, LocalizationSettings, LocalizerSettings
 from cpcbl_team.estimate import Estimate
-from cpcbl_team.inflation import inflate_covariance
+from cpcbl_team.inflation import inflate_covariance, inflate_to
 from cpcbl_team.initial_pose import estimate_of
 from cpcbl_team.inputs import InitialPose
 from cpcbl_team.landmarks import Landmarks
@@ -24,7 +24,7 @@ from cpcbl_team.miscalibration import (
 )
 from cpcbl_team.recovery_evidence import WINDOW_NS, latest
 from cpcbl_team.relocalization import UNKNOWNS, are_apart, readings_of, relocalize
-from cpcbl_team.sender_comparisons import SenderRecords
+from cpcbl_team.sender_comparisons import SenderRecords, contest_m
 from cpcbl_team.sensor_mistakes import (
     MIRRORED,
     ExplainingMistake,
@@ -32,6 +32,7 @@ from cpcbl_team.sensor_mistakes import (
     mirrored,
 )
 from cpcbl_team.state import (
+    FIX,
     Evidence,
     RecoveryMemory,
     State,
@@ -247,7 +248,7 @@ class Recovery:
             if mistake := self._explaining_mistake(state, memory, found, evidence):
                 return self._at_trusted_pose(state, memory, mistake)
             if found is not None:
-                return self._found(state, found, memory)
+                return self._found(state, self._with_contests(state, found, evidence), memory)
             memory = memory._replace(mistake="", lost=reason)
         if memory.mistake:  # nothing new is known
             return self._at_trusted_pose(state, memory, None)
@@ -273,6 +274,16 @@ class Recovery:
                 return with_recovery(state, memory._replace(kidnapped_ns=memory.inflated_ns))
         memory = with_jump(state, memory, state.estimate.pose)
         return with_recovery(state, memory._replace(lost="", kidnapped_ns=-1))
+
+    def _with_contests(
+        self, state: State, found: Estimate, evidence: Sequence[Evidence]
+    ) -> Estimate:
+        """A pose that was found, no more certain than the contests among those whose reports it
+        rests on allow: the silent side of one may be right."""
+        senders = state.memory.teammates.senders
+        names = {e.source.removeprefix(FIX) for e in evidence if e.from_teammate}
+        sigma_m = max((contest_m(senders, n) for n in names if n in senders), default=0.0)
+        return inflate_to(found, sigma_m, self._settings)
 
     def _found(self, state: State, estimate: Estimate, recovery: RecoveryMemory) -> State:
         """The state of a robot that is found again."""

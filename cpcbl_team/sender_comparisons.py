@@ -1,8 +1,13 @@
 """Test 3 of trust: the mean of a sender's reports beside the robot's own sensors, or beside other
 senders. The records that it compares are in `sender_records.py`, the formulas in `mean_offsets.py`
 and `mean_headings.py`; what follows is decided in `trust.py`.
+
+Senders that contradict each other without a decision are in a contest, which lasts until it is
+decided. A party that is silent meanwhile is counted as if it still said what it said, beside where
+its rival says that the robot is.
 """
 
+import math
 from collections.abc import Iterator, Mapping
 from functools import reduce
 from typing import Final
@@ -11,6 +16,7 @@ from msgspec.structs import replace
 
 from cpcbl_team.mean_headings import NO_TURNS, FadingTurns, MeanTurn, contradicting
 from cpcbl_team.mean_offsets import (
+    ALTERNATING_NS,
     FAST,
     SLOW,
     Comparison,
@@ -18,8 +24,9 @@ from cpcbl_team.mean_offsets import (
     both,
     compared_with_majority,
     compared_with_own_sensors,
+    contradicts,
 )
-from cpcbl_team.sender_records import NEVER_NS, SenderRecord
+from cpcbl_team.sender_records import NEVER_NS, Rival, SenderRecord
 
 OWN_SENSORS = ""  # stands for the robot's own sensors among the senders; no robot has this name
 RECENT_NS: Final = 3_000_000_000  # a sender takes part in disputes for so long after a report
@@ -36,8 +43,9 @@ def recent_senders(
 
 
 def voting_means(senders: SenderRecords, now_ns: int, name: str, of: int) -> dict[str, MeanOffset]:
-    """The precise means (`of`: FAST or SLOW) of the recent sources but `name`. Guests have no vote
-    beside two robots of the team, of which `name` may be one."""
+    """The precise means (`of`: FAST or SLOW) of the recent sources but `name`, and of the silent
+    parties of contests with them. Guests have no vote beside two robots of the team, of which
+    `name` may be one."""
     means = {
         other: mean
         for other, r in recent_senders(senders, now_ns, name)
@@ -46,18 +54,76 @@ def voting_means(senders: SenderRecords, now_ns: int, name: str, of: int) -> dic
         and now_ns - r.offsets[of].stamp_ns <= RECENT_NS
     }
     guests = {sender for sender in (*means, name) if senders[sender].is_guest}
-    if len({*means, name} - guests - {OWN_SENSORS}) < 2:
-        return means
-    return {other: mean for other, mean in means.items() if other not in guests}
+    if len({*means, name} - guests - {OWN_SENSORS}) >= 2:
+        means = {other: mean for other, mean in means.items() if other not in guests}
+    return means | _means_of_silent(senders, name, means, now_ns, of)
+
+
+def _means_of_silent(
+    senders: SenderRecords, name: str, means: Mapping[str, MeanOffset], now_ns: int, of: int
+) -> dict[str, MeanOffset]:
+    """What the silent parties of open contests would say now, by what their rivals say."""
+    found: dict[str, MeanOffset] = {}
+    for present, mean in {name: senders[name].means[of], **means}.items():
+        if mean is None or _is_silent(senders[present], now_ns):
+            continue
+        for rival in open_rivals(senders, present):
+            if rival.name != name and _is_silent(senders[rival.name], now_ns):
+                moved = mean._replace(x=mean.x + rival.x, y=mean.y + rival.y)
+                found.setdefault(rival.name, moved)
+    return found
+
+
+def _is_silent(record: SenderRecord, now_ns: int) -> bool:
+    """Whether a sender has no mean of the present, so that the last one may be out of date."""
+    mean = record.means[FAST]
+    return mean is None or now_ns - mean.stamp_ns > ALTERNATING_NS
+
+
+def open_rivals(senders: SenderRecords, name: str) -> tuple[Rival, ...]:
+    """The senders out of quarantine with which this one is in a contest: each contradicts the
+    other."""
+    return tuple(
+        rival
+        for rival in senders[name].rivals
+        if (other := senders.get(rival.name)) is not None
+        and other.reason is None
+        and any(name == back.name for back in other.rivals)
+    )
+
+
+def contest_m(senders: SenderRecords, name: str) -> float:
+    """How far from the estimate the robot may be, by this sender or by one with which it is in a
+    contest; 0 if it is in none."""
+    record, rivals = senders[name], open_rivals(senders, name)
+    mean = record.means[FAST]
+    if mean is None or mean.stamp_ns != record.last_report_ns:  # as if the estimate followed it
+        return max((math.hypot(r.x, r.y) for r in rivals), default=0.0)
+    sides = (mean.length_m, *(math.hypot(mean.x + r.x, mean.y + r.y) for r in rivals))
+    return max(sides) if rivals else 0.0
 
 
 def compare(senders: SenderRecords, name: str, now_ns: int) -> Comparison | None:
-    """The result of test 3; None while the sender has no recent mean that is precise."""
+    """The result of test 3; None while the sender has no recent mean that is precise. A majority
+    decides a contest by both means: in one, the estimate may move fast, and means of a long time
+    differ by that where one sender reported more of late than another."""
     fast, slow = (_comparison_of(senders, name, now_ns, of) for of in (FAST, SLOW))
-    found = both(fast, slow) if fast is not None and slow is not None else fast or slow
+    found = fast or slow
+    if fast is not None and slow is not None:
+        found = both(fast, slow)
+        is_unanimous = fast.is_wrong == slow.is_wrong
+        if not is_unanimous and open_rivals(senders, name) and not _sees(senders, now_ns):
+            found = found._replace(is_wrong=False, is_contested=True)
     if wrong_turn(senders, name, now_ns) is None:
         return found
     return (found or Comparison())._replace(is_wrong=True, is_confirmed=False)
+
+
+def _sees(senders: SenderRecords, now_ns: int) -> bool:
+    """Whether the robot's own sensors have a recent mean that is precise."""
+    own = senders.get(OWN_SENSORS)
+    means = () if own is None else own.means
+    return any(m is not None and m.is_precise and now_ns - m.stamp_ns <= RECENT_NS for m in means)
 
 
 def _comparison_of(senders: SenderRecords, name: str, now_ns: int, of: int) -> Comparison | None:
@@ -65,11 +131,16 @@ def _comparison_of(senders: SenderRecords, name: str, now_ns: int, of: int) -> C
     record, mean = senders[name], senders[name].means[of]
     if record.offsets[of].stamp_ns != now_ns or mean is None or not mean.is_precise:
         return None
-    means = voting_means(senders, now_ns, name, of)
-    own = means.pop(OWN_SENSORS, None)
-    if own is not None:
-        return compared_with_own_sensors(mean, own, means)
-    return compared_with_majority(mean, means)
+    return _result(mean, voting_means(senders, now_ns, name, of))
+
+
+def _result(mean: MeanOffset, others: Mapping[str, MeanOffset]) -> Comparison:
+    """What the others say of a sender's mean: the robot's own sensors, or else the majority."""
+    own = others.get(OWN_SENSORS)
+    if own is None:
+        return compared_with_majority(mean, others)
+    senders = {name: other for name, other in others.items() if name != OWN_SENSORS}
+    return compared_with_own_sensors(mean, own, senders)
 
 
 def wrong_turn(senders: SenderRecords, name: str, now_ns: int) -> MeanTurn | None:
@@ -88,13 +159,41 @@ def wrong_turn(senders: SenderRecords, name: str, now_ns: int) -> MeanTurn | Non
     return contradicting(mean, [*of_landmarks, courses.mean()])
 
 
-def with_comparison(record: SenderRecord, comparison: Comparison, now_ns: int) -> SenderRecord:
+def with_comparison(
+    senders: SenderRecords, name: str, comparison: Comparison, now_ns: int
+) -> SenderRecord:
     """The record of the sender with the result of test 3."""
+    record = senders[name]
     since_ns = now_ns if record.wrong_ns == NEVER_NS else record.wrong_ns
+    rivals = record.rivals
+    if not comparison.is_wrong and record.reason is None:
+        known = {rival.name for rival in open_rivals(senders, name)}
+        rivals = tuple(
+            rival
+            for rival in _contradicted(senders, name, now_ns)
+            if comparison.is_contested or rival.name in known
+        )
     return replace(
         record,
         bias_variance=comparison.bias_variance,
-        contested_ns=now_ns if comparison.is_contested else record.contested_ns,
+        rivals=rivals,
         wrong_ns=since_ns if comparison.is_wrong else NEVER_NS,
         confirmed=record.confirmed + 1 if comparison.is_confirmed else record.confirmed,
     )
+
+
+def _contradicted(senders: SenderRecords, name: str, now_ns: int) -> tuple[Rival, ...]:
+    """The senders that the mean of this one contradicts, and of which nobody says that they are
+    wrong."""
+    found = {}
+    for of in (SLOW, FAST):
+        mean = senders[name].means[of]
+        if mean is None or not mean.is_precise:
+            continue
+        means = {name: mean, **voting_means(senders, now_ns, name, of)}
+        for other, its in means.items():
+            if other == OWN_SENSORS or not contradicts(mean, its):
+                continue
+            if not _result(its, {n: m for n, m in means.items() if n != other}).is_wrong:
+                found[other] = Rival(other, its.x - mean.x, its.y - mean.y)
+    return tuple(found.values())

@@ -100,6 +100,15 @@ class TeammateReport(NamedTuple):
     """The reported heading minus the estimated one, rad, and its variance; None without one."""
 
 
+class Rival(NamedTuple):
+    """Another sender that one contradicts without a decision, and where it says that the robot is,
+    from where that one says so, m. The error of the estimate is not in that difference."""
+
+    name: str
+    x: float
+    y: float
+
+
 class SenderRecord(msgspec.Struct, frozen=True, gc=False):
     """What the robot remembers of one sender."""
 
@@ -127,8 +136,8 @@ class SenderRecord(msgspec.Struct, frozen=True, gc=False):
     means: tuple[MeanOffset | None, ...] = (None, None)  # of these, after the last report
     bias_variance: float = 0.0
     """m^2: of the error that its reports may have in common, by what others say."""
-    contested_ns: int = NEVER_NS
-    """When it last contradicted others without a majority for either side."""
+    rivals: tuple[Rival, ...] = ()
+    """With whom it is in a contest, until that is decided: also while either is silent."""
     wrong_ns: int = NEVER_NS  # since when others say without interruption that its mean is wrong
     confirmed: int = 0  # reports beside which another source agreed with it
     is_guest: bool = False
@@ -148,7 +157,8 @@ def with_report(record: SenderRecord, report: TeammateReport, limit: float) -> S
     if report.heading is not None:
         headings = record.headings.with_report(report.stamp_ns, *report.heading)
         record = replace(record, headings=headings)
-    if report.evidence is not None and report.nis <= OUTLIER_NIS:
+    is_in_dispute = record.score > limit and record.reason is None  # which test 1 decides
+    if report.evidence is not None and report.nis <= OUTLIER_NIS and not is_in_dispute:
         evidence = report.evidence.weighted(min(1.0, CONTRADICTING_NIS / max(report.nis, 1e-9)))
         record = with_evidence(record, report.stamp_ns, evidence)
     return _with_nis(record, report, report.nis, limit)
@@ -274,7 +284,7 @@ def _with_course(
 def quarantined(record: SenderRecord, reason: QuarantineReason, now_ns: int) -> SenderRecord:
     """The record of a sender whose quarantine begins."""
     record = replace(record, agreements=0, confirmations=0, quarantines=record.quarantines + 1)
-    return replace(record, reason=reason, since_ns=now_ns)
+    return replace(record, reason=reason, since_ns=now_ns, rivals=())
 
 
 def released(record: SenderRecord, now_ns: int) -> SenderRecord:

@@ -35,7 +35,7 @@ from cpcbl_team.measurements import (
     observation_of,
 )
 from cpcbl_team.recovery_evidence import without_senders
-from cpcbl_team.sender_comparisons import OWN_SENSORS, RECENT_NS, SenderRecords
+from cpcbl_team.sender_comparisons import OWN_SENSORS, RECENT_NS, SenderRecords, contest_m
 from cpcbl_team.sender_records import NEVER_NS, OffsetEvidence, ReportedPosition, TeammateReport
 from cpcbl_team.state import State, with_memory, with_senders, with_teammates
 
@@ -166,7 +166,10 @@ class TeammateScreen:
         is_new_guest = is_new and self._is_guest(sender)
         least = (rules.guest_sigma_m if is_new_guest else rules.least_sigma_m) ** 2
         more = max(0.0, least - min(dependent.xx, dependent.yy))
-        more += 0.0 if record is None else record.bias_variance
+        if record is not None:
+            more += max(
+                record.bias_variance, contest_m(state.memory.teammates.senders, sender) ** 2
+            )
         return dependent + Covariance2(more, 0.0, more) if more else dependent
 
     def _is_guest(self, sender: str) -> bool:

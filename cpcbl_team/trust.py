@@ -28,6 +28,8 @@ from cpcbl_team.sender_comparisons import (
     RECENT_NS,
     SenderRecords,
     compare,
+    contest_m,
+    open_rivals,
     recent_senders,
     voting_means,
     with_comparison,
@@ -41,6 +43,7 @@ from cpcbl_team.sender_records import (
     OffsetEvidence,
     QuarantineReason,
     ReportedPosition,
+    Rival,
     SenderRecord,
     TeammateReport,
     distances_between,
@@ -60,7 +63,6 @@ LEAST_AGREEMENTS = 10  # reports that must agree with the estimate before a send
 LEAST_CONFIRMATIONS = 2  # or distances that must agree with odometry
 PERSISTENCE_NS: Final = 500_000_000  # a mean that is wrong for so long is no chance
 ALIKE_M: Final = 0.05  # two senders whose offsets differ by no more, or by half of them, agree
-UNDECIDED_NS: Final = 10_000_000_000  # a dispute is undecided so long after a contest of its sides
 LEAST_UNITED: Final = 2  # teammates that agree with each other against the estimate
 MAJORITY_NS: Final = 20_000_000_000  # most senders are not found wrong within so short a time
 
@@ -116,7 +118,10 @@ def assess(
     `used_ns`: when a report of this sender was last used."""
     decision = _decide(senders, name, report, used_ns, rules)
     out = _outvoted_majority(decision, report.stamp_ns) if decision.quarantined else None
-    return _without_decision(decision, out, report.stamp_ns) if out else decision
+    if out:
+        decision = _without_decision(decision, out, report.stamp_ns)
+    least_m = max(decision.least_sigma_m, contest_m(decision.senders, name))
+    return decision._replace(least_sigma_m=least_m)
 
 
 def _decide(
@@ -128,7 +133,7 @@ def _decide(
     senders = {**senders, name: record}
     comparison = compare(senders, name, now)
     if comparison is not None:
-        record = with_comparison(record, comparison, now)
+        record = with_comparison(senders, name, comparison, now)
         senders = {**senders, name: record}
     if record.reason:
         return _assess_quarantined(senders, name, report, comparison, rules)
@@ -142,14 +147,10 @@ def _decide(
         return _quarantine_by_mean(senders, name, now)
     if comparison is not None and (comparison.is_contested or record.score > 0.5 * rules.limit):
         # Others do not contradict it, so rather the estimate is wrong.
-        return TrustDecision(
-            senders, not comparison.is_left_out, least_sigma_m=_contested_m(record)
-        )
+        mean = record.means[FAST]
+        least_m = 0.0 if mean is None else mean.length_m
+        return TrustDecision(senders, not comparison.is_left_out, least_sigma_m=least_m)
     return _decide_dispute(senders, name, now, used_ns, rules)
-
-
-def _is_contested(record: SenderRecord, now_ns: int) -> bool:
-    return now_ns - record.contested_ns <= RECENT_NS
 
 
 def _quarantine_by_mean(senders: SenderRecords, name: str, now_ns: int) -> TrustDecision:
@@ -183,9 +184,7 @@ def _decide_dispute(
     recent = dict(recent_senders(senders, now_ns))
     disputes_ns = [r.dispute_since_ns for r in recent.values() if r.score > rules.limit]
     if not disputes_ns:
-        is_contested = _is_contested(recent[name], now_ns)
-        least_m = _contested_m(recent[name]) if is_contested else 0.0
-        return TrustDecision(senders, True, least_sigma_m=least_m)
+        return TrustDecision(senders, True)
     began_ns = min(disputes_ns)
     dissenters = {n for n, r in recent.items() if r.score > 0.5 * rules.limit}
     supporters = {
@@ -195,10 +194,9 @@ def _decide_dispute(
     }
     if not supporters:
         return TrustDecision(senders, True)
-    sides = dissenters | supporters
-    since_ns = now_ns - UNDECIDED_NS
-    if OWN_SENSORS not in sides and any(recent[n].contested_ns >= since_ns for n in sides):
-        return TrustDecision(senders, True, least_sigma_m=_contested_m(senders[name]))
+    contest = {r.name for n in dissenters for r in open_rivals(senders, n)}
+    if OWN_SENSORS not in dissenters | supporters and contest & supporters:
+        return TrustDecision(senders, True)
     is_right = _is_estimate_right(recent, dissenters, supporters, now_ns - began_ns)
     if is_right is None:
         return TrustDecision(senders, False)
@@ -207,12 +205,6 @@ def _decide_dispute(
     if name in dissenters and recent[name].score > rules.limit:
         return _quarantine(senders, name, now_ns, used_ns)
     return TrustDecision(senders, name not in dissenters)
-
-
-def _contested_m(record: SenderRecord) -> float:
-    """How far from the estimate a contested sender says that the robot is."""
-    mean = record.means[FAST]
-    return 0.0 if mean is None else mean.length_m
 
 
 def _is_estimate_right(
@@ -289,14 +281,23 @@ def _outvoted_majority(decision: TrustDecision, now_ns: int) -> frozenset[str]:
 def _without_decision(decision: TrustDecision, out: frozenset[str], now_ns: int) -> TrustDecision:
     """The decision that nobody can decide: these senders are released, and the estimate is as
     uncertain as they differ from it."""
-    senders, errors_m = dict(decision.senders), [decision.estimate_error_m]
-    for name, record in decision.senders.items():
+    before, errors_m = decision.senders, [decision.estimate_error_m]
+    senders = dict(before)
+    for name, record in before.items():
         if name in out:
             errors_m.append(math.hypot(*record.mean_offset))
             record = released(record, now_ns)
         if not record.reason:
-            senders[name] = replace(record, score=0.0, contested_ns=now_ns)
+            others = [n for n in before if n != OWN_SENSORS and (n in out) != (name in out)]
+            rivals = tuple(_rival(record, n, before[n]) for n in others)
+            senders[name] = replace(record, score=0.0, rivals=rivals)
     return TrustDecision(senders, True, "contested", least_sigma_m=max(errors_m))
+
+
+def _rival(record: SenderRecord, name: str, other: SenderRecord) -> Rival:
+    """Another sender beside this one, by what both said last against the estimate."""
+    (x, y), (ox, oy) = (r.mean_offset if r.score else (0.0, 0.0) for r in (record, other))
+    return Rival(name, ox - x, oy - y)
 
 
 def _assess_quarantined(
@@ -355,8 +356,10 @@ def _agree(one: ReportedPosition, other: ReportedPosition) -> bool:
 
 
 def reset_scores(senders: SenderRecords) -> SenderRecords:
-    """The records after the robot was lost: its own error caused the scores of test 1."""
-    return {n: r if r.reason else replace(r, score=0.0) for n, r in senders.items()}
+    """The records after the robot was lost: its own error caused the scores of test 1, and another
+    estimate has replaced that with which the reports were compared."""
+    reset = {n: r if r.reason else replace(r, score=0.0) for n, r in senders.items()}
+    return {n: without_comparisons(r) for n, r in reset.items()}
 
 
 def forgive(senders: SenderRecords, now_ns: int, since_ns: int = 0) -> SenderRecords:
@@ -384,7 +387,7 @@ def trust_statuses(senders: SenderRecords, now_ns: int) -> tuple[TrustStatus, ..
         if name != OWN_SENSORS and (r.quarantines or now_ns - r.last_report_ns <= RECENT_NS):
             is_only = not any(recent_senders(senders, now_ns, name))
             reason = str(r.reason or "")
-            is_contested = _is_contested(r, now_ns)
+            is_contested = not r.reason and bool(open_rivals(senders, name))
             fields = name, reason, r.since_ns, r.quarantines, is_only, is_contested
             statuses.append(TrustStatus(*fields))
     return tuple(statuses)

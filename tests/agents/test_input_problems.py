@@ -16,7 +16,14 @@ from cpcbl_agents.input_diagnosis.monitor import SELDOM
 from cpcbl_agents.input_diagnosis.problems import without_numbers
 from cpcbl_agents.node import Node, NodeCallbacks, NodeStart
 from cpcbl_agents.robot import build_robot
-from cpcbl_team.config import Field, Landmark, OdometrySettings, RobotSettings, Team
+from cpcbl_team.config import (
+    Field,
+    Landmark,
+    OdometrySettings,
+    RobotSettings,
+    SensorSettings,
+    Team,
+)
 from cpcbl_team.geometry import wrap_angle
 from cpcbl_team.inputs import InputsMended, Odometry, Position, Sighting, Sightings
 from cpcbl_transport import topics
@@ -252,6 +259,15 @@ def test_landmarks_that_are_rarely_seen_are_no_problem() -> None:
 
     driver = Driver()
     assert driver.run(30.0, rarely) == ()
+
+
+def test_landmarks_that_a_robot_does_not_use_say_nothing_of_its_driver() -> None:
+    """A blind robot with poor odometry was told that its bearings are 90 degrees off."""
+    aside = each_sighting(bearing_rad=lambda b: wrap_angle(b + 0.5 * math.pi))
+    for sees_landmarks in (True, False):
+        driver = Driver(sensor=SensorSettings(sees_landmarks=sees_landmarks))
+        problems = driver.run(12.0, aside)
+        assert any("90° off" in text for text in problems) is sees_landmarks
 
 
 def test_a_problem_ends_some_seconds_after_its_cause() -> None:

@@ -10,7 +10,8 @@ from support.core import LOOP_START, SECOND, driven, frame, localizer, loop, pos
 from cpcbl_team.config import OdometrySettings, Start
 from cpcbl_team.geometry import Pose2
 from cpcbl_team.inputs import Fix
-from cpcbl_team.sender_records import ReportedPosition
+from cpcbl_team.sender_records import ReportedPosition, Rival, SenderRecord
+from cpcbl_team.state import State, with_senders, with_teammates
 from cpcbl_team.trust import united_majority
 
 AWAY = Pose2(1.5, 1.0, 2.0)  # where the field is, in the robot's belief: it was carried
@@ -31,16 +32,21 @@ class Carried:
         landmarks_every_s: float = 0.0,
         seconds: float = 16.0,
         seed: int = 1,
+        contest_m: float = 0.0,
     ) -> None:
+        """`contest_m`: how far another teammate, silent since, contradicted all of them."""
         rng = np.random.default_rng(seed)
         self.robot = localizer(
             odometry=NOISE,
             start=Start(x_m=LOOP_START.x, y_m=LOOP_START.y, sigma_m=0.05),
         )
         self.state, self.wrong_s, self.reasons = self.robot.start(0), 0.0, set[str]()
+        self.sigmas_m: list[float] = []  # since it was carried
         every, sees_landmarks = round(10 * EVERY_S), landmarks_every_s > 0.0
         for i, (piece, path) in enumerate(driven(LOOP_START, (loop() * 3)[: round(10 * seconds)])):
             is_away = i > 10 * CARRIED_S
+            if contest_m and i == 10 * CARRIED_S:
+                self.state = contested(self.state, contest_m)
             truth = AWAY @ path if is_away and is_carried else path
             distance = piece.distance_m * (1.0 + 0.05 * rng.normal())
             self.state = self.robot.add_odometry(self.state, replace(piece, distance_m=distance))
@@ -50,6 +56,8 @@ class Carried:
                 name = observers[(i // every * 2 + (i % every) // 5) % len(observers)]
                 seen = AWAY @ path if name in liars and is_away else truth
                 self.state = self.robot.add_fix(self.state, self.fix(name, seen, rng))
+            if is_away:
+                self.sigmas_m.append(self.state.estimate.position_sigma_m)
             self.truth = truth
             self.reasons.add(self.state.lost)
             if not self.state.lost and position_error(self.state.estimate, truth) > 0.5:
@@ -66,6 +74,17 @@ class Carried:
         return {name for name, record in senders.items() if record.quarantines}
 
 
+def contested(state: State, by_m: float) -> State:
+    """All teammates in a contest with one that is silent."""
+    teammates = state.memory.teammates
+    senders = {
+        name: replace(record, rivals=(Rival("silent", by_m, 0.0),))
+        for name, record in teammates.senders.items()
+    }
+    silent = SenderRecord(rivals=tuple(Rival(name, -by_m, 0.0) for name in senders))
+    return with_teammates(state, with_senders(teammates, {**senders, "silent": silent}))
+
+
 @pytest.mark.parametrize("observers", [("a", "b"), ("a", "b", "c"), ("a", "b", "c", "d")])
 def test_a_robot_that_is_carried_away_doubts_itself_after_few_reports(
     observers: tuple[str, ...],
@@ -77,6 +96,14 @@ def test_a_robot_that_is_carried_away_doubts_itself_after_few_reports(
         assert position_error(run.state.estimate, run.truth) < 0.4
         assert not run.state.lost
         assert run.quarantined == set()
+
+
+def test_a_pose_found_in_reports_of_one_side_of_a_contest_is_as_uncertain_as_that() -> None:
+    run = Carried("abc", contest_m=0.4)
+    assert run.state.counts["found_again"] == 1
+    assert position_error(run.state.estimate, run.truth) < 0.4
+    assert min(run.sigmas_m[10:]) >= 0.399
+    assert min(Carried("abc").sigmas_m[10:]) < 0.2
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,13 @@ from support.trust import AGREES, CONTRADICTS, RULES, Receiver
 
 from cpcbl_team.estimate import Covariance3
 from cpcbl_team.sender_comparisons import OWN_SENSORS
-from cpcbl_team.sender_records import USUAL_NIS, OffsetEvidence, SenderRecord, TeammateReport
+from cpcbl_team.sender_records import (
+    USUAL_NIS,
+    OffsetEvidence,
+    Rival,
+    SenderRecord,
+    TeammateReport,
+)
 from cpcbl_team.trust import assess, trust_statuses
 
 
@@ -231,12 +237,12 @@ def test_a_dispute_of_contested_senders_stays_undecided_after_their_means_are_st
 ) -> None:
     """A robot that was lost meanwhile has no means; the first dispute decided for one side."""
     receiver.receive(1.0, a=AGREES, b=AGREES)
-    contested = {n: replace(r, contested_ns=receiver.now_ns) for n, r in receiver.senders.items()}
-    receiver.senders = contested
-    receiver.receive(5.0, a=AGREES, b=CONTRADICTS)
+    rivals = {"a": (Rival("b", 0.5, 0.0),), "b": (Rival("a", -0.5, 0.0),)}
+    receiver.senders = {n: replace(r, rivals=rivals[n]) for n, r in receiver.senders.items()}
+    receiver.receive(13.0, a=AGREES, b=CONTRADICTS)
     assert receiver.quarantined == {}
-    receiver.receive(8.0, a=AGREES, b=CONTRADICTS)
-    assert receiver.quarantined.keys() == {"b"}
+    assert all(d.least_sigma_m == pytest.approx(0.5) for _, d in receiver.decisions[-20:])
+    assert all(s.contested for s in trust_statuses(receiver.senders, receiver.now_ns))
 
 
 def test_a_report_that_contradicts_the_estimate_has_less_weight_in_the_mean() -> None:

@@ -1,8 +1,6 @@
 """What faulty teammates do to a whole filter that receives their fixes and beliefs."""
 
-import math
 import random
-from collections.abc import Callable, Mapping
 from functools import cache
 
 import numpy as np
@@ -19,116 +17,25 @@ from support.core import (
     heading_error,
     localizer,
     loop,
-    position_error,
     sensor_noise,
     state_at,
 )
+from support.observed_drive import NOISE, Drive, Observed, correct, faulty
 from support.sweeps import over_seeds
-from support.trust import MS, RULES
+from support.trust import MS
 
 from cpcbl_team.config import (
-    CollaborationSettings,
-    OdometrySettings,
     SensorSettings,
     Start,
     TrustSettings,
     Variant,
 )
 from cpcbl_team.geometry import Pose2, wrap_angle
-from cpcbl_team.inputs import Fix, Input, Odometry, Sighting, Sightings
+from cpcbl_team.inputs import Odometry, Sighting, Sightings
 from cpcbl_team.localizer import Localizer
 from cpcbl_team.state import State
 from cpcbl_team.timeline import Timeline
 from cpcbl_team.trust import trust_statuses
-
-NOISE = OdometrySettings(distance_sigma_m_per_sqrt_m=0.05)
-Observed = Callable[[int, Pose2, np.random.Generator], tuple[float, float] | None]
-
-
-def correct(ns: int, truth: Pose2, rng: np.random.Generator) -> tuple[float, float]:
-    return truth.x + 0.05 * rng.normal(), truth.y + 0.05 * rng.normal()
-
-
-def faulty(kind: str, from_s: float = 5.0, until_s: float = 15.0) -> Observed:
-    """An observer with this fault, that is correct before and after."""
-    last: list[tuple[float, float]] = []
-
-    def position(ns: int, truth: Pose2, rng: np.random.Generator) -> tuple[float, float]:
-        x, y = correct(ns, truth, rng)
-        if not from_s * SECOND <= ns < until_s * SECOND:
-            last[:] = [(x, y)]
-            return x, y
-        if kind == "frozen":
-            return last[0]
-        if kind == "overconfident":
-            return x + 0.4 * rng.normal(), y + 0.4 * rng.normal()
-        if kind == "jumps":
-            turn = 2.4 * (ns // (2 * SECOND))
-            return x + 1.5 * math.cos(turn), y + 1.5 * math.sin(turn)
-        return x + 0.6, y
-
-    return position
-
-
-class Drive:
-    """A robot that drives rounds and receives fixes, and its errors."""
-
-    def __init__(
-        self,
-        observers: Mapping[str, Observed],
-        *,
-        seed: int = 1,
-        sees_landmarks: bool = False,
-        variant: Variant = "joint",
-        rules: TrustSettings = RULES,
-        rounds: int = 2,
-        claimed_m: float = 0.05,
-    ) -> None:
-        rng = np.random.default_rng(seed)
-        self.robot = localizer(
-            variant,
-            sensor=SensorSettings(sees_landmarks=sees_landmarks),
-            odometry=NOISE,
-            collaboration=CollaborationSettings(trust=rules),
-            start=Start(x_m=LOOP_START.x, y_m=LOOP_START.y, sigma_m=0.05),
-        )
-        self.state = self.robot.start(0)
-        self.inputs: list[Input] = []
-        self.errors: list[float] = []
-        noise = sensor_noise(rng, self.robot.settings.sensor)
-        for piece, truth in driven(LOOP_START, loop() * rounds):
-            distance = piece.distance_m * (1.0 + 0.05 * rng.normal())
-            inputs: list[Input] = [
-                Odometry(piece.from_ns, piece.stamp_ns, distance, piece.turn_rad)
-            ]
-            if sees_landmarks:
-                inputs.append(frame(truth, piece.stamp_ns, noise=noise))
-            for name, observed in observers.items():
-                position = observed(piece.stamp_ns, truth, rng)
-                if position is not None:
-                    c = (claimed_m**2, 0.0, claimed_m**2)
-                    inputs.append(Fix("me", name, piece.stamp_ns, *position, c, (1e-4, 0.0, 1e-4)))
-            for item in inputs:
-                self.take(item)
-            self.errors.append(position_error(self.state.estimate, truth))
-
-    def take(self, item: Input) -> None:
-        self.inputs.append(item)
-        steps: dict[type, Callable[..., State]] = {
-            Odometry: self.robot.add_odometry,
-            Sightings: self.robot.cycle,
-            Fix: self.robot.add_fix,
-        }
-        self.state = steps[type(item)](self.state, item)
-
-    @property
-    def rmse_m(self) -> float:
-        return math.sqrt(sum(e * e for e in self.errors) / len(self.errors))
-
-    @property
-    def quarantines(self) -> dict[str, int]:
-        voices = self.state.memory.teammates.senders
-        return {name: v.quarantines for name, v in voices.items() if v.quarantines}
 
 
 @cache

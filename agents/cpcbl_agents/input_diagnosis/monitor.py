@@ -169,7 +169,7 @@ class InputMonitor:
             {},
             tuple(_expected_inputs(settings)),
             team.map.names | frozenset(team.robots),
-            field.landmarks,
+            field.landmarks if settings.sensor.sees_landmarks else {},
             settings.sensor,
             wheels,
             field.bounds(),

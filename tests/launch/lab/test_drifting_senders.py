@@ -105,3 +105,12 @@ def test_a_drifting_observer_that_states_a_small_sigma_is_found_and_does_little_
         figures = score(recorder.samples(name, truth[name], liars.FROM_S))
         assert figures.position_rmse_m is not None
         assert figures.position_rmse_m < 0.08, name
+
+
+@pytest.mark.timeout(300)
+def test_a_sudden_error_beside_one_correct_observer_is_decided_by_the_earlier_estimate() -> None:
+    """Test 3 called both observers contested before test 1 could decide; odometry was lost then."""
+    case = liars.Case(lie="bias:0.5,0.5", honest=1)
+    run = liars.run_fault(case, 4)
+    assert max(run.rmse_m.values()) < 0.07  # 0.17 m before
+    assert {q.of for q in run.quarantines} == {liars.LIAR}
