@@ -115,7 +115,7 @@ def test_poses_in_usual_light_are_honest() -> None:
 
 def test_near_and_central_is_better_than_far_and_oblique() -> None:
     team = team_of({"L": (0.0, 0.0, RED_YELLOW)})
-    eyes = CylinderDetector("viewer", team, Camera(calibrated()))
+    eyes = CylinderDetector("viewer", team, Camera(calibrated(centre_share=0.0)))
 
     def sigmas(range_m: float, bearing: float) -> tuple[float, float]:
         (one,) = eyes.detections(picture(team, Pose2(-range_m, 0.0, -bearing))).found
