@@ -20,6 +20,7 @@ MOST_ROWS = 32_766  # cv2.remap numbers the rows of its result with 16 bits
 LEAST_CONTRAST = 5.0  # grey levels between a marker's black and its margin's white
 BORDER_SPOILT, MARGIN_SPOILT = 0.10, 0.15  # shares of cells that a highlight or a finger may cover
 MOST_SCATTER = 0.25  # of the cells of border and margin, as a share of the contrast
+MOST_SCATTER_SPOILT = 0.2  # if a part is covered, and random bits are often a marker of the family
 SHARPENING = 0.25
 MOST_CHANCE, MOST_CHANCE_SPOILT = 2e-4, 3e-5
 """That random bits are taken for a marker of the family: so many wrong bits are corrected. The
@@ -63,6 +64,8 @@ class MarkerReader:
         self._margin_plane = _Plane(basis, self._margin)
         self._border_plane = _Plane(basis, self._border)
         self._codes = self._turned_codes()
+        patterns, bits = self._codes.shape
+        self._is_telling = patterns < MOST_CHANCE * 2.0**bits
         self._correctable, self._correctable_spoilt = (
             _correctable(self._codes.shape, self.layout.correctable, chance)
             for chance in (MOST_CHANCE, MOST_CHANCE_SPOILT)
@@ -85,8 +88,9 @@ class MarkerReader:
         spoilt_margin = (levels < middle)[:, self._margin].mean(axis=1)
         framed = (spoilt_border <= BORDER_SPOILT) & (spoilt_margin <= MARGIN_SPOILT)
         framed &= 2.0 * half[:, ~self._margin].min(axis=1) > LEAST_CONTRAST
-        framed &= self._scatter(levels, white, black, middle) < MOST_SCATTER
         whole = (spoilt_border == 0.0) & (spoilt_margin == 0.0)
+        most_scatter = np.where(whole | self._is_telling, MOST_SCATTER, MOST_SCATTER_SPOILT)
+        framed &= self._scatter(levels, white, black, middle) < most_scatter
         (at,) = framed.nonzero()
         shades = _sharpened(levels[at] - middle[at]) / half[at]
         bits = shades[:, self._data]

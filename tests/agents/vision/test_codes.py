@@ -105,6 +105,22 @@ def test_a_highlight_on_the_border_is_no_matter_but_then_no_bit_is_corrected(
 
 
 @pytest.mark.parametrize(
+    ("family", "is_read"), [("aruco_4x4_50", False), ("apriltag_25h9", True), (STANDARD, True)]
+)
+def test_uneven_and_covered_is_no_marker_where_random_bits_often_are(
+    family: MarkerFamily, is_read: bool
+) -> None:
+    """Grass was once marker 16 of 4x4."""
+    codes, cell = MarkerReader(family), QUAD // MarkerReader(family).layout.quad
+    y, x = np.mgrid[:PICTURE, :PICTURE] // cell
+    uneven = np.where((x + y) % 2, 35.0, -35.0)
+    pixels = 48.0 + 160.0 / 255.0 * marker_paper(family, 3) + uneven
+    pixels[FIRST : FIRST + cell, FIRST + cell : FIRST + 2 * cell] = 208.0
+    read = codes.read(pixels.astype(np.uint8), SQUARE[None])
+    assert read == ({0: MarkerCode(3, 0)} if is_read else {})
+
+
+@pytest.mark.parametrize(
     ("family", "most"), [("aruco_4x4_50", 0), ("apriltag_36h11", 2), (STANDARD, 3)]
 )
 def test_as_many_wrong_bits_are_set_right_as_chance_allows(family: MarkerFamily, most: int) -> None:
