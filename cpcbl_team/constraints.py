@@ -46,20 +46,21 @@ CURVED_SHARE: Final = 1e-3
 """Below this ratio of the position's variance to the squared distance, curves count as straight."""
 
 
-def curvature(prior: Covariance3, dx: float, dy: float) -> tuple[float, float]:
+def curvature(prior: Covariance3, dx: float, dy: float, turns: bool = True) -> tuple[float, float]:
     """The mean squares of what a linear range (m^2) and a linear bearing (rad^2) leave out.
 
     With the prior's errors a across and r along the line of sight, and the distance d, these are
     a^2 / 2 d and a r / d^2: the second-order terms (Jazwinski 1970, section 9.3). Where the heading
     is wide an error is a rigid motion of the plane (see `wide_headings.py`). With its turn w they
     are a (a + d w) / 2 d and r (2 a + d w) / 2 d^2, so that a turn about the object leaves nothing.
+    Not so for readings that do not turn the robot (`turns` is False): ranges alone.
     """
     xx, xy, yy, xh, yh, hh = prior
     squared = dx * dx + dy * dy
     along = (dx * dx * xx + 2.0 * dx * dy * xy + dy * dy * yy) / squared
     across = xx + yy - along
     common = (dx * dy * (yy - xx) + (dx * dx - dy * dy) * xy) / squared
-    if hh <= WIDE_HEADING_RAD2:
+    if hh <= WIDE_HEADING_RAD2 or not turns:
         of_range = 0.75 * across * across / squared
         of_bearing = (along * across + 2.0 * common * common) / (squared * squared)
         return of_range, of_bearing

@@ -242,9 +242,8 @@ def left_out(prior: Estimate, m: Measurement, cs: list[Constraint]) -> list[floa
     dx, dy, variances = x - own_x, y - own_y, own.xx + place.xx + (own.yy + place.yy)
     if m.wall is not None or variances <= CURVED_SHARE * (dx * dx + dy * dy):
         return [0.0] * len(cs)
-    if m.is_for_heading:  # what moves the heading alone leads along no arc
-        own = own._replace(xh=0.0, yh=0.0, hh=0.0)
-    of_range, of_bearing = curvature(own.plus(Covariance3(*place, 0.0, 0.0, 0.0)), dx, dy)
+    turns = m.bearing is not None and not m.is_for_heading  # else it leads along no arc
+    of_range, of_bearing = curvature(own.plus(Covariance3(*place, 0.0, 0.0, 0.0)), dx, dy, turns)
     return [of_bearing * c.row[2] ** 2 if c.is_bearing else of_range for c in cs]
 
 

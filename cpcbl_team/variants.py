@@ -77,10 +77,13 @@ class JointVariant:
         """Steps 4 and 5: all evidence combined, then merged with the prior (equations 3 and 4).
         The observations of teammates follow one by one."""
         scope, evidence = self.scope(scope), landmarks.evidence.sums()
-        bends = scope is POSE and prior.covariance.hh > WIDE_HEADING_RAD2
+        total = combine(Information.of(evidence), accepted) if accepted else evidence
+        (_, _, _, _, _, of_heading), _ = total
+        # Ranges alone say nothing of a turn, and a gate that it opens would confirm wrong poses
+        bends = of_heading > 0.0 and scope is POSE and prior.covariance.hh > WIDE_HEADING_RAD2
         if not accepted and not bends:
             return self.merge(prior, evidence, scope)
-        estimate = merge(prior, combine(Information.of(evidence), accepted), scope)
+        estimate = merge(prior, total, scope)
         for found in accepted:
             if found.observation is not None:
                 dx, dy = estimate.pose.x - prior.pose.x, estimate.pose.y - prior.pose.y

@@ -157,7 +157,7 @@ def composed(robot: Localizer, state: State, frame: Sightings) -> tuple[Estimate
     is_whole = r.variant == "joint" or (ranges_turn and scope is POSITION)
     whole = POSE if is_whole else scope
     after = merge(prior, evidence, whole)
-    if whole is POSE and prior.covariance.hh > WIDE_HEADING_RAD2:
+    if whole is POSE and evidence.matrix.hh > 0.0 and prior.covariance.hh > WIDE_HEADING_RAD2:
         after = along_arc(prior, after)
     if r.paper_uncertainty and r.variant != "joint":
         after = after._replace(covariance=after.covariance._replace(xh=0.0, yh=0.0))
