@@ -41,6 +41,7 @@ from cpcbl_team.state import State, with_memory, with_senders, with_teammates
 
 LEAST_CONFIRMED = 20  # reports of a guest beside which others agreed, until it counts as the others
 INDEPENDENT_FRAMES = 0.1  # of a camera: the next frame has nearly the same errors of tilt and edges
+CHANGING_M2 = 0.05**2  # of the square of an error of the estimate, from one report to the next
 FARTHEST_OFFSET_M = 1.0  # of what a frame tells of the position, where it tells little
 MOST_SENDERS = 512  # of which records are kept
 
@@ -273,9 +274,12 @@ class TeammateScreen:
 
 
 def _evidence_at(state: State, sums: Sums, dependent: Covariance2 = NOTHING) -> OffsetEvidence:
-    """Sums about the offset of the state's estimate, with the error of its position in them."""
+    """Sums about the offset of the state's estimate, with the error of its position in them. Of an
+    error that lasts, as in a contest, only a part changes between reports: the rest is what means
+    shall find."""
     c = state.estimate.covariance
-    sums = with_position_error(sums, Covariance2(c.xx, c.xy, c.yy))
+    share = min(1.0, CHANGING_M2 / max(c.xx + c.yy, CHANGING_M2))
+    sums = with_position_error(sums, Covariance2(share * c.xx, share * c.xy, share * c.yy))
     return OffsetEvidence(sums, dependent, c.hh, c.xx + c.yy)
 
 
