@@ -80,7 +80,8 @@ class JointVariant:
         total = combine(Information.of(evidence), accepted) if accepted else evidence
         (_, _, _, _, _, of_heading), _ = total
         # Ranges alone say nothing of a turn, and a gate that it opens would confirm wrong poses
-        bends = of_heading > 0.0 and scope is POSE and prior.covariance.hh > WIDE_HEADING_RAD2
+        has_bearing = of_heading > 0.0 or any(f.measurement.bearing is not None for f in accepted)
+        bends = has_bearing and scope is POSE and prior.covariance.hh > WIDE_HEADING_RAD2
         if not accepted and not bends:
             return self.merge(prior, evidence, scope)
         estimate = merge(prior, total, scope)
