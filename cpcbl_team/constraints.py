@@ -17,7 +17,7 @@ import math
 from math import cos, sin
 from typing import Final, NamedTuple
 
-from cpcbl_team.estimate import WIDE_HEADING_RAD2, Covariance3, Row
+from cpcbl_team.estimate import Covariance3, Row
 from cpcbl_team.gaussian import width_per_m
 from cpcbl_team.geometry import Pose2, wrap_angle
 
@@ -46,29 +46,19 @@ CURVED_SHARE: Final = 1e-3
 """Below this ratio of the position's variance to the squared distance, curves count as straight."""
 
 
-def curvature(prior: Covariance3, dx: float, dy: float, turns: bool = True) -> tuple[float, float]:
+def curvature(prior: Covariance3, dx: float, dy: float) -> tuple[float, float]:
     """The mean squares of what a linear range (m^2) and a linear bearing (rad^2) leave out.
 
     With the prior's errors a across and r along the line of sight, and the distance d, these are
-    a^2 / 2 d and a r / d^2: the second-order terms (Jazwinski 1970, section 9.3). Where the heading
-    is wide an error is a rigid motion of the plane (see `wide_headings.py`). With its turn w they
-    are a (a + d w) / 2 d and r (2 a + d w) / 2 d^2, so that a turn about the object leaves nothing.
-    Not so for readings that do not turn the robot (`turns` is False): ranges alone.
+    a^2 / 2 d and a r / d^2: the second-order terms (Jazwinski 1970, section 9.3).
     """
-    xx, xy, yy, xh, yh, hh = prior
+    xx, xy, yy, _, _, _ = prior
     squared = dx * dx + dy * dy
     along = (dx * dx * xx + 2.0 * dx * dy * xy + dy * dy * yy) / squared
     across = xx + yy - along
     common = (dx * dy * (yy - xx) + (dx * dx - dy * dy) * xy) / squared
-    if hh <= WIDE_HEADING_RAD2 or not turns:
-        of_range = 0.75 * across * across / squared
-        of_bearing = (along * across + 2.0 * common * common) / (squared * squared)
-        return of_range, of_bearing
-    turn, across_turn, along_turn = squared * hh, dx * yh - dy * xh, dx * xh + dy * yh
-    moved, moved_common = across + 2.0 * across_turn + turn, across + across_turn
-    of_range = 0.25 * (across * moved + 2.0 * moved_common * moved_common) / squared
-    both, both_common = 3.0 * across + 2.0 * across_turn + moved, 2.0 * common + along_turn
-    of_bearing = 0.25 * (along * both + 2.0 * both_common * both_common) / (squared * squared)
+    of_range = 0.75 * across * across / squared
+    of_bearing = (along * across + 2.0 * common * common) / (squared * squared)
     return of_range, of_bearing
 
 

@@ -89,7 +89,6 @@ class Covariance3(NamedTuple):
 
 SMALLEST_VARIANCE: Final = 1e-10  # (10 um)^2, (10 urad)^2: what is called exact
 SHARPEST_VARIANCE: Final = 1e-8  # of a measurement: sharper ones drown I + P A in rounding
-WIDE_HEADING_RAD2: Final = 0.01  # of a heading: below (5.7 deg)^2 arcs count as straight
 ZERO3: Final = Covariance3(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 Row = tuple[float, float, float]
 

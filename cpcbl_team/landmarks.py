@@ -205,7 +205,7 @@ class Landmarks:
                         return
         prior = update.covariance
         if prior.xx + prior.yy > CURVED_SHARE * distance_squared:
-            of_range, of_bearing = curvature(prior, dx, dy, bearing is not None)
+            of_range, of_bearing = curvature(prior, dx, dy)
             range_weight = _curved_weight(range_weight, prior, (u, v, 0.0), of_range)
             bearing_weight = _curved_weight(bearing_weight, prior, (m, n, 1.0), of_bearing)
         # The NIS of a prior that is certain; that of an uncertain one is smaller.

@@ -242,8 +242,7 @@ def left_out(prior: Estimate, m: Measurement, cs: list[Constraint]) -> list[floa
     dx, dy, variances = x - own_x, y - own_y, own.xx + place.xx + (own.yy + place.yy)
     if m.wall is not None or variances <= CURVED_SHARE * (dx * dx + dy * dy):
         return [0.0] * len(cs)
-    turns = m.bearing is not None and not m.is_for_heading  # else it leads along no arc
-    of_range, of_bearing = curvature(own.plus(Covariance3(*place, 0.0, 0.0, 0.0)), dx, dy, turns)
+    of_range, of_bearing = curvature(own.plus(Covariance3(*place, 0.0, 0.0, 0.0)), dx, dy)
     return [of_bearing * c.row[2] ** 2 if c.is_bearing else of_range for c in cs]
 
 

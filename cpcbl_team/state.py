@@ -25,7 +25,6 @@ from cpcbl_team.range_errors import RangeEvidence
 from cpcbl_team.self_calibration import ReferencePoses, SelfCalibration
 from cpcbl_team.sender_records import SenderRecord
 from cpcbl_team.stationary_pose import StationaryRecord
-from cpcbl_team.wide_headings import with_arc
 
 FIX = "fix:"  # marks the source of an active fix, apart from a sighting of that teammate
 _NONE: Mapping[str, Any] = MappingProxyType({})
@@ -233,7 +232,7 @@ class State(NamedTuple):
     @property
     def reported(self) -> Estimate:
         """The estimate as it is belief to others: as uncertain as the settings are, too."""
-        return with_doubts(with_arc(self.estimate), self.memory.calibration.check)
+        return with_doubts(self.estimate, self.memory.calibration.check)
 
     @property
     def common_errors(self) -> CommonErrors | None:

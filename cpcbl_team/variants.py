@@ -12,7 +12,6 @@ from cpcbl_team.estimate import (
     HEADING,
     POSE,
     POSITION,
-    WIDE_HEADING_RAD2,
     Covariance3,
     Estimate,
     Information,
@@ -27,7 +26,6 @@ from cpcbl_team.geometry import Pose2, wrap_angle
 from cpcbl_team.landmarks import LandmarkUpdate
 from cpcbl_team.measurements import GatedObject, combine
 from cpcbl_team.motion import NO_VARIANCE, MotionVariance, move
-from cpcbl_team.wide_headings import along_arc
 
 UpdateOrder = tuple[Scope | None, ...]
 
@@ -77,14 +75,9 @@ class JointVariant:
         """Steps 4 and 5: all evidence combined, then merged with the prior (equations 3 and 4).
         The observations of teammates follow one by one."""
         scope, evidence = self.scope(scope), landmarks.evidence.sums()
-        total = combine(Information.of(evidence), accepted) if accepted else evidence
-        (_, _, _, _, _, of_heading), _ = total
-        # Ranges alone say nothing of a turn, and a gate that it opens would confirm wrong poses
-        has_bearing = of_heading > 0.0 or any(f.measurement.bearing is not None for f in accepted)
-        bends = has_bearing and scope is POSE and prior.covariance.hh > WIDE_HEADING_RAD2
-        if not accepted and not bends:
+        if not accepted:
             return self.merge(prior, evidence, scope)
-        estimate = merge(prior, total, scope)
+        estimate = merge(prior, combine(Information.of(evidence), accepted), scope)
         for found in accepted:
             if found.observation is not None:
                 dx, dy = estimate.pose.x - prior.pose.x, estimate.pose.y - prior.pose.y
@@ -94,7 +87,7 @@ class JointVariant:
                 observation = found.observation.shifted(dx, dy, turn)
                 by_teammate = bool(found.measurement.sender)
                 estimate = self.observe(estimate, observation, within, by_teammate)
-        return self.reduce(along_arc(prior, estimate) if bends else estimate)
+        return self.reduce(estimate)
 
     def observe(
         self, prior: Estimate, observation: Observation, scope: Scope, by_teammate: bool = True

@@ -10,7 +10,6 @@ from support.core import (
     SECOND,
     angles,
     coordinates,
-    covariance3,
     diagonal,
     localizer,
     point_sighting,
@@ -276,37 +275,11 @@ def test_what_a_linear_reading_leaves_out(
     along, across = rng.normal(size=(2, 200_000)) * [[along_m], [across_m]]
     of_range = np.hypot(6.0 - along, across) - (6.0 - along)
     of_bearing = np.arctan2(-across, 6.0 - along) + across / 6.0
-    prior = Covariance3(covariance[0, 0], covariance[0, 1], covariance[1, 1], 0.0, 0.0, 0.005)
+    prior = Covariance3(covariance[0, 0], covariance[0, 1], covariance[1, 1], 0.0, 0.0, 0.1)
     found = curvature(prior, 6.0 * c, 6.0 * s)
     assert found == pytest.approx(
         (np.mean(of_range**2), np.mean(of_bearing**2)), rel=0.25, abs=2e-6
     )
-
-
-@pytest.mark.parametrize("direction", [0.0, 0.7, 2.5])
-@pytest.mark.parametrize("lever_m", [0.0, 3.0, -2.0])
-def test_what_a_linear_reading_leaves_out_where_the_heading_is_wide(
-    direction: float, lever_m: float
-) -> None:
-    """By sampling rigid motions of the plane; a turn moves the robot across the line of sight."""
-    c, s = math.cos(direction), math.sin(direction)
-    rng = np.random.default_rng(4)
-    turn, along, across = rng.normal(size=(3, 200_000)) * [[0.15], [0.4], [0.3]]
-    across += lever_m * turn
-    moved = np.array([c * along - s * across, s * along + c * across])
-    prior = covariance3(np.cov([*moved, turn]))
-    sine, versed = np.sin(turn) / turn, (1.0 - np.cos(turn)) / turn
-    x, y = sine * along - versed * across, versed * along + sine * across
-    of_range = np.hypot(6.0 - x, y) - (6.0 - along)
-    of_bearing = np.arctan2(-y, 6.0 - x) + across / 6.0
-    found = curvature(prior, 6.0 * c, 6.0 * s)
-    assert found == pytest.approx((np.mean(of_range**2), np.mean(of_bearing**2)), rel=0.25)
-
-
-def test_a_turn_about_an_object_bends_none_of_its_readings() -> None:
-    turn = np.array([2.0, -6.0, 1.0])  # of a robot from which the object is at (6, 2)
-    prior = covariance3(0.2 * np.outer(turn, turn))
-    assert curvature(prior, 6.0, 2.0) == pytest.approx((0.0, 0.0), abs=1e-12)
 
 
 @given(st.floats(1e-6, 1.0), st.floats(1e-6, 1.0), st.floats(0.0, 0.99))

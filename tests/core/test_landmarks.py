@@ -24,7 +24,6 @@ from cpcbl_team.config import Field, Gives, Landmark, LocalizerSettings, SensorS
 from cpcbl_team.estimate import (
     POSE,
     POSITION,
-    WIDE_HEADING_RAD2,
     Estimate,
     Information,
     Scope,
@@ -44,7 +43,6 @@ from cpcbl_team.measurements import (
 )
 from cpcbl_team.sensors import sighting_fault
 from cpcbl_team.state import State, Updates
-from cpcbl_team.wide_headings import along_arc
 
 NOW = 5 * SECOND
 NAMES = "abcde"
@@ -155,10 +153,7 @@ def composed(robot: Localizer, state: State, frame: Sightings) -> tuple[Estimate
         return prior, counts
     ranges_turn = r.variant == "oval" and robot.field.gives_only_ranges and not r.paper_uncertainty
     is_whole = r.variant == "joint" or (ranges_turn and scope is POSITION)
-    whole = POSE if is_whole else scope
-    after = merge(prior, evidence, whole)
-    if whole is POSE and evidence.matrix.hh > 0.0 and prior.covariance.hh > WIDE_HEADING_RAD2:
-        after = along_arc(prior, after)
+    after = merge(prior, evidence, POSE if is_whole else scope)
     if r.paper_uncertainty and r.variant != "joint":
         after = after._replace(covariance=after.covariance._replace(xh=0.0, yh=0.0))
     return with_circular_position(after) if r.variant == "circular" else after, counts

@@ -114,10 +114,6 @@ def worlds() -> dict[str, World]:
     for gives, text in KINDS[1:]:
         team = with_settings(_alone(_field(4, gives)), None, start=wide)
         found[f"wide prior{text}"] = World(team, ("r",))
-    hardly_known = {"sigma_m": 1.0, "heading_sigma_deg": 45.0}
-    for count in (1, 2):
-        team = with_settings(_alone(_field(count)), None, start=hardly_known)
-        found[f"start known to 1 m and 45 deg, {_landmarks(count)}"] = World(team, ("r",))
     found |= _odometry_worlds() | _unknown_pose_worlds()
     found |= _team_worlds() | _miscalibrated_worlds()
     return found | _uncertain_map_worlds() | _unsurveyed_worlds()
