@@ -59,6 +59,12 @@ def without_errors(sighting: Sighting, errors: CameraErrors, axis_rad: float) ->
     )
 
 
+def sigmas_of(covariance: Sequence[Sequence[float]]) -> CameraErrors:
+    """The sigmas of the errors by their covariance (of its first three rows and columns)."""
+    number = len(CameraErrors._fields)
+    return CameraErrors(*(math.sqrt(max(covariance[i][i], 0.0)) for i in range(number)))
+
+
 def range_sensitivity(range_m: float, off_axis_rad: float) -> tuple[float, float, float]:
     """The derivatives of a range by yaw, focal length and centre: (m/rad, m, m)."""
     c, s = math.cos(off_axis_rad), math.sin(off_axis_rad)

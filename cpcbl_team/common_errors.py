@@ -18,6 +18,7 @@ from cpcbl_team.camera_errors import (
     heading_sensitivity,
     range_sensitivity,
     reading_variances,
+    sigmas_of,
     without_errors,
 )
 from cpcbl_team.estimate import ZERO3, Estimate, Row, dot
@@ -67,8 +68,7 @@ class CommonErrors(NamedTuple):
     @property
     def camera_sigmas(self) -> CameraErrors:
         """Of what is left of the errors of the camera."""
-        covariance = self.parameters.covariance
-        return CameraErrors(*(math.sqrt(max(covariance[i][i], 0.0)) for i in range(CAMERA)))
+        return sigmas_of(self.parameters.covariance)
 
     def reading_variances(self, bearing_rad: float) -> tuple[float, float]:
         """What the camera adds to the variance of a reading at this bearing: of the range, as a

@@ -88,21 +88,16 @@ class Limits(NamedTuple):
 
 def lost_reason(estimate: Estimate, innovations: int, limits: Limits) -> str:
     """Why the robot is lost; empty if it is not."""
-    position_variance, heading_variance, _, _ = limits
+    position_variance, heading_variance, least, most = limits
     xx, _, yy, _, _, hh = estimate.covariance
     if 0.5 * (xx + yy) > position_variance:
         return f"position sigma {estimate.position_sigma_m:.2f} m"
     if hh > heading_variance:
         return f"heading sigma {math.degrees(estimate.heading_sigma_rad):.0f} deg"
-    if rejects_most(innovations, limits):
-        return "{} of the last {} innovations rejected".format(*rejected_of(innovations))
-    return ""
-
-
-def rejects_most(innovations: int, limits: Limits) -> bool:
-    """Whether the robot is lost because of what it rejects."""
     rejected, length = rejected_of(innovations)
-    return rejected > limits.rejected and length >= limits.innovations
+    if rejected > most and length >= least:
+        return f"{rejected} of the last {length} innovations rejected"
+    return ""
 
 
 def undetermined(
@@ -167,10 +162,9 @@ class Recovery:
         memory = state.memory.recovery
         limits = self._limits_when_lost if memory.lost else self._limits
         reason = lost_reason(state.estimate, state.updates.innovations, limits)
-        if memory.kidnapped_ns >= 0 and not rejects_most(state.updates.innovations, limits):
+        if memory.kidnapped_ns >= 0 and not reason:
             evidence = self.evidence(memory, state.memory.calibration.adaptation)
-            why = undetermined(evidence, state.updates.objects_ns, memory.kidnapped_ns)
-            reason = why or reason  # it is the cause of a large sigma, too
+            reason = undetermined(evidence, state.updates.objects_ns, memory.kidnapped_ns)
         if reason:
             return self._recover(state, reason)
         if memory.lost:

@@ -41,7 +41,7 @@ from cpcbl_team.state import State, with_memory, with_senders, with_teammates
 
 LEAST_CONFIRMED = 20  # reports of a guest beside which others agreed, until it counts as the others
 INDEPENDENT_FRAMES = 0.1  # of a camera: the next frame has nearly the same errors of tilt and edges
-CHANGING_M2 = 0.05**2  # of the square of an error of the estimate, from one report to the next
+CHANGING_M2 = 0.05**2  # the most of the variance (xx + yy) that is another error at the next report
 FARTHEST_OFFSET_M = 1.0  # of what a frame tells of the position, where it tells little
 MOST_SENDERS = 512  # of which records are kept
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from benchmarks.degraded import false_markers, measured, printed
+from benchmarks.degraded import Score, false_markers, measured, printed
 from benchmarks.degraded_frames import KINDS, textures
 from benchmarks.photographs import tags_read
 from benchmarks.readers import opencv_reader, own_reader
@@ -31,25 +31,25 @@ LEAST_RECALL = {
     "jpeg": 0.65,
     "noise": 0.65,
 }
-
-
 LEAST_STANDARD_RECALL = {"clean": 0.6, "low light": 0.4, "occlusion": 0.5, "noise": 0.5}
+
+
+def score_without_wrong(kind: str, family: MarkerFamily) -> Score:
+    score = measured(kind, FRAMES, family, textures(4, np.random.default_rng(3)), seed=2)
+    assert score.wrong == 0
+    return score
 
 
 @pytest.mark.parametrize("kind", LEAST_STANDARD_RECALL)
 def test_standard_tags_are_recalled_and_none_is_wrong(kind: str) -> None:
-    backgrounds = textures(4, np.random.default_rng(3))
-    score = measured(kind, FRAMES, "apriltag_standard41h12", backgrounds, seed=2)
-    assert score.wrong == 0
+    score = score_without_wrong(kind, "apriltag_standard41h12")
     assert score.recall >= LEAST_STANDARD_RECALL[kind]
     assert max(max(errors, default=0.0) for errors in score.errors.values()) < 3.0
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_markers_of_a_bad_camera_are_recalled_and_none_is_wrong(kind: str) -> None:
-    backgrounds = textures(4, np.random.default_rng(3))
-    score = measured(kind, FRAMES, "apriltag_36h11", backgrounds, seed=2)
-    assert score.wrong == 0
+    score = score_without_wrong(kind, "apriltag_36h11")
     assert score.recall >= LEAST_RECALL[kind]
     for errors in score.errors.values():
         assert sum(error >= 3.0 for error in errors) <= 1

@@ -128,5 +128,5 @@ class Drive:
 
     @property
     def quarantines(self) -> dict[str, int]:
-        voices = self.state.memory.teammates.senders
-        return {name: v.quarantines for name, v in voices.items() if v.quarantines}
+        senders = self.state.memory.teammates.senders
+        return {name: r.quarantines for name, r in senders.items() if r.quarantines}

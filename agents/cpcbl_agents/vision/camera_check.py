@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cpcbl_agents.vision.camera import wrap_angles
-from cpcbl_team.camera_errors import CameraErrors
+from cpcbl_team.camera_errors import CameraErrors, sigmas_of
 from cpcbl_team.config import OdometryNoise, Start
 from cpcbl_team.estimate import ZERO3, Estimate
 from cpcbl_team.geometry import Pose2
@@ -48,7 +48,7 @@ class Estimated(NamedTuple):
 
     @property
     def sigmas(self) -> CameraErrors:
-        return CameraErrors(*(math.sqrt(max(self.covariance[i][i], 0.0)) for i in range(CAMERA)))
+        return sigmas_of(self.covariance)
 
     @property
     def turn_rad(self) -> float:

@@ -2,6 +2,7 @@
 
 import math
 from collections import Counter
+from collections.abc import Sequence
 
 import msgspec
 
@@ -22,7 +23,6 @@ POSSIBLE, CLEARER = 9.0, 9.0
 other error alone at least so much more."""
 BEYOND_SIGMAS = 3.0  # an error that is larger is none that the filter reckons with
 USUAL_RANGE_M = 2.0  # at which a wrong focal length has moved the robot
-NOTHING = Estimated(NO_ERRORS, ((0.0,) * 3,) * 3)
 
 
 class CameraCorrection:
@@ -47,7 +47,9 @@ class CameraCorrection:
         self._guess: Pose2 | None = None
         self.found: Estimated | None = None
         """The errors of the camera, once one of them was clear."""
-        self._applied, self._applied_estimate = NO_ERRORS, NOTHING
+        self._applied = NO_ERRORS
+        self._covariance: Sequence[Sequence[float]] = ()
+        """Of the errors that are applied."""
         self._fx_px, self._roll = camera.fx_px, math.radians(camera.roll_deg)
 
     @property
@@ -91,7 +93,7 @@ class CameraCorrection:
         if s.bearing_sigma_rad is None or s.bearing_rad is None:
             return s
         off_axis = s.bearing_rad - self._axis
-        of_range, of_bearing = reading_variances(self._applied_estimate.covariance, off_axis)
+        of_range, of_bearing = reading_variances(self._covariance, off_axis)
         bearing_sigma = math.hypot(s.bearing_sigma_rad, math.sqrt(of_bearing))
         range_sigma = s.range_sigma_m
         if range_sigma is not None and s.range_m is not None:
@@ -116,7 +118,7 @@ class CameraCorrection:
         if not any(abs(c) > least for c, least in zip(changes, self._least_change, strict=True)):
             return None
         turn, focal, centre = changes
-        self._applied, self._applied_estimate = now, estimated
+        self._applied, self._covariance = now, estimated.covariance
         return InputsMended(stamp_ns, turn + centre, abs(focal) * USUAL_RANGE_M)
 
 
