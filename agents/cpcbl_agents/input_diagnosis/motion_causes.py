@@ -12,9 +12,10 @@ import math
 from bisect import bisect_left
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from itertools import combinations, pairwise
-from statistics import median
+from statistics import mean, median
 from typing import NamedTuple
 
+from cpcbl_agents.input_diagnosis.rays import ray_error
 from cpcbl_team import sensor_mistakes as mistakes
 from cpcbl_team.config import Landmark
 from cpcbl_team.geometry import Pose2
@@ -31,7 +32,6 @@ NOTABLE = 0.3  # a change of where a landmark is seen, as a share of its range
 TIE = 1.25  # mistakes that fit nearly as well as the best one are named with it
 NEAR_M, NEAR_RAD = 2.0, 0.2  # moved since the start
 LEAST_AREA = 0.1  # of a triangle, as a share of the square of its longest side
-FAR_M = 8.0  # taken for a landmark of which only the bearing is known
 
 
 class Step(NamedTuple):
@@ -51,6 +51,7 @@ class Resighting(NamedTuple):
     until_ns: int
     before: complex
     after: complex
+    is_ray: bool = False  # only its bearing was measured: it was there or nearer
 
 
 class Mistake(NamedTuple):
@@ -148,11 +149,18 @@ def motion_cause(
         explained = sum(fit[i] < min(tolerance, 0.5 * as_it_came[i]) for i in wrong)
         spoilt = sum(e > tolerance for i, e in enumerate(fit) if as_it_came[i] <= tolerance)
         if explained >= LEAST_CASES and explained - spoilt > MOST * len(wrong):
-            found.append((median(fit), text))
+            found.append((_typical(fit, resightings), text))
     if found:
         best = min(found)[0]
         return next(text for fit, text in found if fit <= TIE * best)
     return ""
+
+
+def _typical(fit: Sequence[float], resightings: Sequence[Resighting]) -> float:
+    """The median error; of rays the mean, for many motions agree with more than half of them."""
+    if any(seen.is_ray for seen in resightings):
+        return mean(min(error, 1.0) for error in fit)
+    return median(fit)
 
 
 def contradicts(as_it_came: Sequence[float], tolerance: float) -> bool:
@@ -171,12 +179,20 @@ def errors(
     times_ns = {ns for r in resightings for ns in r[:2]}  # a frame has several landmarks
     at = {ns: _pose_at(ns, stamps, poses) for ns in times_ns}
     found = []
-    for since_ns, until_ns, before, after in resightings:
-        (a, h), (b, k) = at[since_ns], at[until_ns]
+    for seen in resightings:
+        (a, h), (b, k) = at[seen.since_ns], at[seen.until_ns]
         displacement = (b - a) * cmath.rect(1.0, -h) * mistake.direction
-        expected = (before - displacement) * cmath.rect(1.0, h - k)
-        found.append(abs(expected - after) / max(abs(before), abs(after), 1.0))
+        found.append(_error(seen, displacement, seen.after * cmath.rect(1.0, k - h)))
     return found
+
+
+def _error(seen: Resighting, displacement: complex, after: complex) -> float:
+    """How far off a landmark is seen again, as a share of its range; `after` in the frame that the
+    robot had before."""
+    if seen.is_ray:
+        return ray_error(seen.before, after, displacement)
+    reach_m = max(abs(seen.before), abs(after), 1.0)
+    return abs(seen.before - displacement - after) / reach_m
 
 
 def fixed_errors(
@@ -195,9 +211,8 @@ def fixed_errors(
     driven = driven if sign > 0 else [d.conjugate() for d in driven]
     seen = [r.before - r.after for r in resightings]
     fitted = cmath.phase(sum(p * d.conjugate() for p, d in zip(seen, driven, strict=True)) or 1.0)
-    far = [abs(p - d * cmath.rect(1.0, fitted)) for p, d in zip(seen, driven, strict=True)]
-    reach = [max(abs(r.before), abs(r.after), 1.0) for r in resightings]
-    return [f / r for f, r in zip(far, reach, strict=True)]
+    turned = cmath.rect(1.0, fitted)
+    return [_error(r, d * turned, r.after) for r, d in zip(resightings, driven, strict=True)]
 
 
 def _track(
@@ -254,11 +269,12 @@ def resightings(
     frames: Iterable[Sightings],
     steps: Sequence[Step],
     names: Mapping[str, Landmark],
+    reach_m: float,
     least_ns: int = SOON_NS[0],
     most_ns: int = SOON_NS[1],
 ) -> Iterator[Resighting]:
     """Each landmark and a later sighting of it within the time of the steps: as soon as it shows a
-    motion, or after so long."""
+    motion, or after so long. `reach_m`: how far the sensor sees."""
     if len(steps) < 2:
         return
     # The first step is left out: a total in its last piece has nothing before it
@@ -269,7 +285,7 @@ def resightings(
         if not begin_ns <= stamp_ns <= end_ns:
             continue
         for seen in frame.sightings:
-            if seen.id not in names or (place := place_of(seen)) is None:
+            if seen.id not in names or (place := place_of(seen, reach_m)) is None:
                 continue
             waiting = begun.setdefault(seen.id, [])
             for since_ns, before in waiting[:]:
@@ -279,17 +295,17 @@ def resightings(
                 if gap_ns >= most_ns or (
                     abs(place - before) > NOTABLE * max(abs(place), abs(before))
                 ):
-                    yield Resighting(since_ns, stamp_ns, before, place)
+                    yield Resighting(since_ns, stamp_ns, before, place, seen.range_m is None)
                     waiting.remove((since_ns, before))
             if not waiting or stamp_ns - waiting[-1][0] >= SPACING_NS:
                 waiting.append((stamp_ns, place))
 
 
-def place_of(seen: Sighting) -> complex | None:
-    """Where the robot's frame has what it saw (m); far away if only the bearing is known."""
+def place_of(seen: Sighting, far_m: float = 1.0) -> complex | None:
+    """Where the robot's frame has what it saw (m); so far away if only the bearing is known."""
     if seen.bearing_rad is None:
         return None
-    range_m = FAR_M if seen.range_m is None else seen.range_m
+    range_m = far_m if seen.range_m is None else seen.range_m
     return cmath.rect(range_m, seen.bearing_rad) if range_m > 0.0 else None
 
 
@@ -366,13 +382,12 @@ def view_cause(
 ) -> str:
     """Which mistake in sightings agrees with the map at a pose; empty if they agree as they are, or
     none does."""
-    own = complex(pose.x, pose.y)
-    due = [
-        (p, (complex(marks[s.id].x_m, marks[s.id].y_m) - own) * cmath.rect(1.0, -pose.heading))
-        for frame in frames
-        for s in frame.sightings
-        if s.id in marks and (p := place_of(s)) is not None
-    ]
+    own, turned = complex(pose.x, pose.y), cmath.rect(1.0, -pose.heading)
+    due = []
+    for s in (s for frame in frames for s in frame.sightings if s.id in marks):
+        q = (complex(marks[s.id].x_m, marks[s.id].y_m) - own) * turned
+        if (p := place_of(s, abs(q))) is not None:
+            due.append((p, q))
     if len(due) < LEAST_CASES:
         return ""
     found = []

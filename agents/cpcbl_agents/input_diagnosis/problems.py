@@ -71,8 +71,7 @@ REASONS = {
     "frame_failed": "images make the detector fail; the robot's log has the error",
     "frame_repeated": "images repeat the one before exactly; the camera or its driver hangs",
     "camera_upside_down": "the camera is upside down",
-    "frame_black": "images are black",
-    **{f"frame_{what}": f"images are {what}" for what in ("white", "blank")},
+    **{f"frame_{what}": f"images are {what}" for what in ("black", "white", "blank")},
     "off_field": "a pose that somebody gave is far from the map",
 }
 """What each reason of a refused input says to people; docs/refused_inputs.md has the remedies."""
@@ -307,13 +306,14 @@ def _motion(
     right_order, wrong_order = motions.order_votes(frames[-5:], marks)
     if wrong_order >= causes.LEAST_CASES and wrong_order > 4 * right_order:
         return f"sightings: {mistakes.MIRRORED}; or the map is mirrored"
-    tolerance = 0.15 + 3.0 * math.hypot(sensor.range_share, sensor.bearing_sigma_rad)
-    tolerance = min(tolerance, MOST_TOLERANCE)
-    soon = list(motions.resightings(frames, steps, marks))
+    sigma = math.hypot(sensor.range_share, sensor.bearing_sigma_rad)
+    tolerance = min(0.15 + 3.0 * sigma, MOST_TOLERANCE)
+    seen = frames, steps, marks, sensor.max_range_m
+    soon = list(motions.resightings(*seen))
     is_right, cause = _shift_of_landmarks(facts, frames, steps)
     cause = cause or motions.motion_cause(soon, steps, motions.errors(soon, steps), tolerance)
     if not cause:
-        late = list(motions.resightings(frames, steps, marks, *motions.LATER_NS))
+        late = list(motions.resightings(*seen, *motions.LATER_NS))
         errors = motions.errors(late, steps)
         cause = motions.motion_cause(late, steps, errors, tolerance)
         is_contradicted = not cause and motions.contradicts(errors, 1.5 * tolerance)
