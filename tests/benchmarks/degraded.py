@@ -5,7 +5,8 @@ For each kind of degradation it prints how many of the markers were recalled, wr
 of errors inside three stated sigmas and the worst of them, and the 99th percentile of the time of a
 frame as a multiple of OpenCV's. The peers are in the extra `bench`; a family that one of them does
 not have is compared with the other alone. `--photographs FOLDER` counts instead how many tags of
-photographs each of them reads (`photographs.py`).
+photographs each of them reads (`photographs.py`), and `--landmarks N` shows the detector landmarks
+in shadow and in poor light (`shaded_landmarks.py`).
 """
 
 import argparse
@@ -28,8 +29,11 @@ from benchmarks.degraded_frames import (
     degraded_frame,
     marker_ratio,
 )
+from benchmarks.landmark_frames import LIGHTS
 from benchmarks.photographs import tags_read
 from benchmarks.readers import Reader, own_reader, peers
+from benchmarks.shaded_landmarks import false_landmarks, shaded_landmarks
+from benchmarks.shaded_landmarks import printed as printed_landmarks
 from rich.console import Console
 from rich.table import Table
 from support.cameras import calibrated
@@ -208,6 +212,7 @@ def main() -> None:
     parser.add_argument("--family", choices=get_args(MarkerFamily), default="apriltag_36h11")
     parser.add_argument("--kinds", default=",".join(KINDS), help="separated by commas")
     parser.add_argument("--crops", type=int, default=0, help="natural pictures without a marker")
+    parser.add_argument("--landmarks", type=int, default=0, help="frames of each light, instead")
     parser.add_argument("--photographs", type=Path, help="read those of a folder instead")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--out", type=Path, default=Path("build/degraded.json"))
@@ -220,6 +225,12 @@ def main() -> None:
         Console().print(f"{due} tags in photographs, read by: {counts}")
         return
     backgrounds, readers = natural_pictures(), list(others.values())
+    if chosen.landmarks:
+        seen = [
+            shaded_landmarks(light, chosen.landmarks, backgrounds, chosen.seed) for light in LIGHTS
+        ]
+        Console(width=160).print(printed_landmarks(seen))
+        return
     scores = [
         measured(kind, chosen.frames, chosen.family, backgrounds, readers, chosen.seed)
         for kind in chosen.kinds.split(",")
@@ -231,6 +242,8 @@ def main() -> None:
     if chosen.crops:
         false = false_markers(chosen.family, backgrounds, chosen.crops, chosen.seed)
         console.print(f"{chosen.crops} natural pictures without a marker: {false} false markers")
+        named, ranged = false_landmarks(backgrounds, chosen.crops, chosen.seed)
+        console.print(f"the same for the team `eyes`: {named} false names, {ranged} with a range")
 
 
 if __name__ == "__main__":

@@ -92,6 +92,10 @@ class CylinderDetector:
             return Ambiguity("too_small", names, pair.outline)
         outlines = self._angular_outlines(pixels, pair)
         fits = {kind: _best_fit(kind.shape, outlines) for kind in kinds}
+        if all(fit is None or fit.hidden is not None for fit in fits.values()):
+            # A shadow line may have been taken for an edge.
+            outlines += self._angular_outlines(pixels, pair, in_shadow=True)
+            fits = {kind: _best_fit(kind.shape, outlines) for kind in kinds}
         accepted = [fit for fit in fits.values() if fit is not None]
         if not accepted:
             return Ambiguity(self._rejection_reason(kinds, outlines), names, pair.outline)
@@ -129,11 +133,13 @@ class CylinderDetector:
                 kinds = (k for bands, ks in self._kinds.items() if blob.colour in bands for k in ks)
                 yield Ambiguity("one_band_only", _names(kinds), blob.outline)
 
-    def _angular_outlines(self, pixels: Pixels, pair: Candidate) -> list[AngularOutline]:
+    def _angular_outlines(
+        self, pixels: Pixels, pair: Candidate, in_shadow: bool = False
+    ) -> list[AngularOutline]:
         patch = panorama_patch(pixels, self._panorama, pair)
         if patch is None:
             return []
-        outlines = possible_outlines(patch, self._panorama, pair)
+        outlines = possible_outlines(patch._replace(in_shadow=in_shadow), self._panorama, pair)
         clear = (one for one in outlines if self._has_clear_colours(patch, pair, one))
         return [self._angular_outline(one) for one in clear]
 

@@ -30,8 +30,11 @@ LEAST_PATCH_PX = 3
 LEAST_WIDTH = 1.0
 INSET = 0.2  # of a band, above and below the rows that tell its sides
 APART_PX = 1.5  # the sides of two bands
+LEAN = 0.05  # of an upright line in the panorama: a roll of 3 deg that the settings do not state
 LEAST_CONTRAST = 10.0  # grey levels, over the three channels
 NEAREST_PX, FARTHEST_PX = 1.5, 3.0  # from an edge: where the colour of its side is taken
+LEAST_SINE = 0.3  # of the angle between two colours that differ in more than brightness
+LEAST_LIGHT = 0.01  # in a shadow, over that at the edge
 ROUNDS = 4  # until an edge is found
 SETTLED_PX = 0.1
 
@@ -77,10 +80,13 @@ class Outline(NamedTuple):
 
 
 class Profile:
-    """Colours (n, 3) along a line, the first one at `start`, the next a step farther on."""
+    """Colours (n, 3) along a line, the first one at `start`, the next a step farther on.
 
-    def __init__(self, colours: Floats, start: float) -> None:
-        self._colours, self._start = colours, start
+    `in_shadow`: an edge is where colours change in more than brightness, if they do.
+    """
+
+    def __init__(self, colours: Floats, start: float, in_shadow: bool = False) -> None:
+        self._colours, self._start, self._in_shadow = colours, start, in_shadow
         self._sums = np.zeros((len(colours) + 1, 3))
         np.cumsum(colours, axis=0, out=self._sums[1:])
 
@@ -107,7 +113,8 @@ class Profile:
             return math.nan
         first = max(0, int(at - reach - 1.0))
         part = self._colours[first : int(at + reach + 3.0)]
-        shares = ((part - before) @ way / contrast).tolist()
+        share = _share_in_any_light if self._in_shadow else _share
+        shares = share(part, before, behind).tolist()
         steps = enumerate(itertools.pairwise(shares), start=first)
         places = [i + (0.5 - a) / (b - a) for i, (a, b) in steps if a < 0.5 <= b]
         return min(places, key=lambda place: abs(place - at), default=math.nan)
@@ -121,11 +128,15 @@ class Profile:
 
 
 class Patch(NamedTuple):
-    """A part of the panorama, (rows, columns, 3), and where it begins."""
+    """A part of the panorama, (rows, columns, 3), and where it begins.
+
+    `in_shadow`: as in `Profile`.
+    """
 
     pixels: Pixels
     left: int
     top: int
+    in_shadow: bool = False
 
     def region(self, left: float, right: float, top: float, bottom: float) -> Pixels:
         """The pixels between these columns and rows; at least one."""
@@ -133,11 +144,13 @@ class Patch(NamedTuple):
 
     def vertical_profile(self, left: float, right: float) -> Profile:
         """The mean of the columns between these, row by row."""
-        return Profile(_mean(self.pixels[:, self._columns(left, right)], 1), self.top)
+        columns = self.pixels[:, self._columns(left, right)]
+        return Profile(_mean(columns, 1), self.top, self.in_shadow)
 
     def horizontal_profile(self, top: float, bottom: float) -> Profile:
         """The mean of the rows between these, column by column."""
-        return Profile(_mean(self.pixels[self._rows(top, bottom)], 0), self.left)
+        rows = self.pixels[self._rows(top, bottom)]
+        return Profile(_mean(rows, 0), self.left, self.in_shadow)
 
     def _rows(self, top: float, bottom: float) -> slice:
         return _from_to(top - self.top, bottom - self.top, self.pixels.shape[0])
@@ -200,7 +213,8 @@ def possible_outlines(patch: Patch, panorama: Panorama, candidate: Candidate) ->
     inset = INSET * min(mid - upper.top, lower.bottom - mid)
     upper_columns = patch.horizontal_profile(upper.top + inset, mid - inset)
     lower_columns = patch.horizontal_profile(mid + inset, lower.bottom - inset)
-    found = _possible_sides(_sides(upper_columns, upper), _sides(lower_columns, lower))
+    leaning = LEAN * 0.5 * (lower.bottom - upper.top)
+    found = _possible_sides(_sides(upper_columns, upper), _sides(lower_columns, lower), leaning)
     missing = {TOP: math.isnan(top), FOOT: math.isnan(foot), WIDTH: not found}
     hidden = frozenset(part for part, is_missing in missing.items() if is_missing)
     found = found or [(min(upper.left, lower.left), max(upper.right, lower.right))]
@@ -220,9 +234,14 @@ def _sides(columns: Profile, band: ColourBlob) -> Sides:
     return _edge(columns, band.left, band.width), _edge(columns, band.right, band.width)
 
 
-def _possible_sides(upper: Sides, lower: Sides) -> list[Sides]:
-    """The mean sides of both bands if they are one above the other, else all combinations."""
-    if all(abs(a - b) <= APART_PX for a, b in zip(upper, lower, strict=True)):
+def _possible_sides(upper: Sides, lower: Sides, leaning: float) -> list[Sides]:
+    """The mean sides of both bands if they are one above the other, else all combinations.
+
+    The bands of a camera that leans are shifted against each other, both sides alike.
+    """
+    left, right = (b - a for a, b in zip(upper, lower, strict=True))
+    leans = abs(right - left) <= APART_PX and 0.5 * abs(left + right) <= APART_PX + leaning
+    if leans or (abs(left) <= APART_PX and abs(right) <= APART_PX):  # NaN is neither
         return [(0.5 * (upper[0] + lower[0]), 0.5 * (upper[1] + lower[1]))]
     pairs = itertools.product((upper[0], lower[0]), (upper[1], lower[1]))
     return [(left, right) for left, right in pairs if right - left >= LEAST_WIDTH]
@@ -273,6 +292,25 @@ def _with_frame_cuts(panorama: Panorama, outline: Outline) -> Outline:
 def _search_range(size: float) -> float:
     """How far (px) an edge may be from the end of the colour of a part of this size."""
     return min(max(0.25 * size, 2.5), 8.0)
+
+
+def _share(colours: Floats, before: Floats, behind: Floats) -> Floats:
+    """How far colours (n, 3) are on the way from the one before an edge to the one behind it."""
+    way = behind - before
+    return np.asarray((colours - before) @ way / (way @ way))
+
+
+def _share_in_any_light(colours: Floats, before: Floats, behind: Floats) -> Floats:
+    """The same where a shadow line is near, which changes how bright both colours are, but not
+    what they are: each of the colours (n, 3) is b times the one before and d times the one behind
+    (least squares), and the share is d / (b + d)."""
+    aa, bb, ab = float(before @ before), float(behind @ behind), float(before @ behind)
+    determinant = aa * bb - ab * ab
+    if determinant <= LEAST_SINE**2 * aa * bb:  # or one of them is black
+        return _share(colours, before, behind)
+    first, second = colours @ before, colours @ behind
+    b, d = bb * first - ab * second, aa * second - ab * first
+    return np.asarray(d / np.maximum(b + d, LEAST_LIGHT * determinant))
 
 
 def _from_to(start: float, end: float, size: int) -> slice:

@@ -40,6 +40,19 @@ def test_there_is_no_edge(guess: float) -> None:
     assert math.isnan(Profile(line(20.0, 0.6), 0.0).edge(guess, 4.0, 3.0))
 
 
+@pytest.mark.parametrize("at", [19.0, 20.4])
+@pytest.mark.parametrize("shadow_px", [-2.5, -1.5, 1.5, 2.5])
+def test_a_shadow_line_beside_an_edge_is_no_edge(at: float, shadow_px: float) -> None:
+    light = 1.0 - 0.65 * (line(at + shadow_px, 0.5)[:, :1] - 140.0) / (40.0 - 140.0)
+    found = Profile(light * line(at, 0.5), 0.0, in_shadow=True).edge(at, 3.0, 4.0)
+    assert found == pytest.approx(at, abs=0.4)
+
+
+def test_in_shadow_an_edge_of_brightness_alone_is_still_one() -> None:
+    found = Profile(line(20.3, 0.6, behind=0.4 * WALL), 0.0, in_shadow=True).edge(19.0, 4.0, 4.0)
+    assert found == pytest.approx(20.3, abs=0.06)
+
+
 def test_faint_change_is_no_edge() -> None:
     faint = line(20.0, 0.6, before=WALL, behind=WALL + 3.0)
     assert math.isnan(Profile(faint, 0.0).edge(20.0, 4.0, 4.0))

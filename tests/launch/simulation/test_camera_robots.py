@@ -13,6 +13,9 @@ from pathlib import Path
 import pytest
 from support.cameras import jpeg, picture, png, streaming, url
 from support.hostile_frames import tiles, turned_marker
+from support.markers import CARRIED, standing
+from support.markers import picture as marker_picture
+from support.markers import team as marked_team
 from support.processes import cpcbl_team, eventually
 from support.routers import open_router
 
@@ -85,15 +88,29 @@ class Driven:
         that are so late."""
 
         def is_said() -> bool:
-            for image in images:
-                self.frames.put(encode(Frame(time.time_ns() - late_ns, image)))
-                time.sleep(0.1)
-            self.counts()
-            return any(
-                text in problem for status in self._statuses[-1:] for problem in status.problems
-            )
+            self._show(images, late_ns)
+            return any(text in problem for problem in self.problems())
 
         return eventually(is_said, PATIENCE_S)
+
+    def says_no_more(self, text: str, images: Sequence[bytes]) -> bool:
+        """Whether its status stops to say this while it receives these images again and again."""
+
+        def is_gone() -> bool:
+            self._show(images)
+            return not any(text in problem for problem in self.problems())
+
+        return eventually(is_gone, PATIENCE_S)
+
+    def problems(self) -> tuple[str, ...]:
+        """What its latest status says of problems."""
+        return tuple(p for status in self._statuses[-1:] for p in status.problems)
+
+    def _show(self, images: Sequence[bytes], late_ns: int = 0) -> None:
+        for image in images:
+            self.frames.put(encode(Frame(time.time_ns() - late_ns, image)))
+            time.sleep(0.1)
+        self.counts()
 
     def until(self, **counts: int) -> None:
         """Returns when it has counted so much."""
@@ -172,6 +189,28 @@ def test_a_camera_that_goes_wrong_is_said_in_one_line_and_the_robot_goes_on(
         robot.frames.put(encode(Frame(time.time_ns(), good(4))))
         assert robot.counted("sightings", before + 1)
         assert robot.counted("odometry", robot.counts()["odometry"] + 5)
+
+
+def test_a_camera_that_is_upside_down_is_said_in_one_line_until_it_is_turned_back(
+    tmp_path: Path,
+) -> None:
+    team, carried = tmp_path / "team.toml", marked_team({"r2": CARRIED["r0"]})
+    team.write_text(MARKED)
+    upright = [marker_picture(carried, [standing("r2", 1.3, 5.0, 160.0)], seed=n) for n in range(8)]
+    with driven(team) as robot:
+        assert robot.says("the camera is upside down", [jpeg(p[::-1, ::-1]) for p in upright])
+        before = robot.counts()
+        assert before["camera_upside_down"] > 0
+        (said,) = [one for one in robot.problems() if "upside down" in one]
+        assert "turn it" in said
+        robot.frames.put(encode(Frame(time.time_ns(), jpeg(upright[0][::-1, ::-1]))))
+        assert robot.counted("camera_upside_down", before["camera_upside_down"] + 1)
+        assert robot.counts().get("sightings", 0) == before.get("sightings", 0)
+        assert robot.counted("odometry", before["odometry"] + 5)
+        assert robot.says_no_more("the camera is upside down", [jpeg(p) for p in upright])
+        used = robot.counts().get("sightings", 0)
+        robot.frames.put(encode(Frame(time.time_ns(), jpeg(upright[0]))))
+        assert robot.counted("sightings", used + 1)
 
 
 def hostile_frames() -> list[bytes]:

@@ -1,0 +1,28 @@
+"""Landmarks in shadow and in poor light: what is ranged, and that nothing is wrong.
+
+The bounds are below what `make bench-degraded ARGS='--landmarks 100'` measures by what 16 frames
+leave to chance.
+"""
+
+import numpy as np
+import pytest
+from benchmarks.degraded_frames import textures
+from benchmarks.landmark_frames import LIGHTS, LightKind
+from benchmarks.shaded_landmarks import false_landmarks, printed, shaded_landmarks
+
+FRAMES = 16
+
+
+@pytest.mark.parametrize("light", LIGHTS)
+def test_landmarks_in_any_light_are_ranged_and_none_is_wrong(light: LightKind) -> None:
+    score = shaded_landmarks(light, FRAMES, textures(6, np.random.default_rng(3)), seed=3)
+    assert score.wrong == 0
+    assert score.ranged >= (0.7 if light in {"low light", "warm lamp"} else 0.8)
+    for errors in (score.ranges, score.bearings):
+        off, sigmas = np.abs(np.array(errors)).T
+        assert (off < 4.0 * sigmas).all()
+    assert printed([score]).row_count == 1
+
+
+def test_no_landmark_is_in_pictures_without_one() -> None:
+    assert false_landmarks(textures(12, np.random.default_rng(4)), 16) == (0, 0)
