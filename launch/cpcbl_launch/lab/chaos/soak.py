@@ -1,9 +1,14 @@
 """A soak test: faults in random order for any time, and what the processes hold afterwards."""
 
 import random
+import shutil
+import tempfile
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
 from statistics import mean, median
+
+from msgspec.structs import replace
 
 from cpcbl_launch.lab.chaos import injectors
 from cpcbl_launch.lab.chaos.checks import Check, equal_to
@@ -19,8 +24,16 @@ from cpcbl_launch.lab.chaos.memory import (
 from cpcbl_launch.lab.chaos.run_log import worst
 from cpcbl_launch.lab.chaos.scenario import FaultRun, ScenarioOptions, ScenarioResult, latest
 from cpcbl_launch.lab.chaos.schedule import PlannedFault
-from cpcbl_launch.lab.chaos.team import FIELD, ROUTER, RunPlan, demo_team, run_team
+from cpcbl_launch.lab.chaos.team import (
+    FIELD,
+    ROUTER,
+    ChaosError,
+    RunPlan,
+    demo_team,
+    run_team,
+)
 from cpcbl_launch.run.processes import require_process_usage
+from cpcbl_team.config.recording import RecordingSettings
 from cpcbl_team.errors import InputError
 from cpcbl_transport.messages import Track
 
@@ -30,6 +43,7 @@ FAULT_S = (2.0, 6.0)
 UNDISTURBED_S = LEAST_LIFE_S + 10.0  # at the end nothing is killed, so that every process is judged
 SHORTEST_S = UNDISTURBED_S + 30.0
 STUCK_S = 30.0
+RECORDING = RecordingSettings(segment_bytes=16 * 2**20, keep_bytes=96 * 2**20)  # of each robot
 MOVED_S = 15.0  # after the death of a field all robots stand elsewhere, and have to notice it
 
 
@@ -43,10 +57,25 @@ def require_judged_soak(duration_s: float) -> None:
 
 
 def soak(options: ScenarioOptions) -> ScenarioResult:
-    """Kills, suspends, cuts, slows, floods and repeats, in random order."""
+    """Kills, suspends, cuts, slows, floods and repeats, in random order. The recordings of the
+    robots are kept if a check is not met."""
     require_process_usage("chaos soak")
-    settings = demo_team()
-    plan = RunPlan(settings, options.seed, relayed=list(settings.robots), watched=True)
+    recordings = Path(tempfile.mkdtemp(prefix="cpcbl-soak-"))
+    remark = f"recorded: cpcbl-team replay {recordings}"
+    try:
+        result = _soak(options, recordings)
+    except ChaosError as error:
+        raise ChaosError(f"{error}; {remark}") from error
+    if not all(check.is_met for check in result.checks):
+        return result._replace(remarks=(*result.remarks, remark))
+    shutil.rmtree(recordings)
+    return result
+
+
+def _soak(options: ScenarioOptions, recordings: Path) -> ScenarioResult:
+    settings = replace(demo_team(), recording=RECORDING)
+    relayed = list(settings.robots)
+    plan = RunPlan(settings, options.seed, relayed, watched=True, recordings=recordings)
     plan = plan._replace(secured=options.secured)
     options.report_progress("starting a team")
     with run_team(plan, options.machine) as team:

@@ -20,6 +20,7 @@ from cpcbl_launch.lab.chaos.machine import IDLE, MachineWatch
 from cpcbl_launch.lab.chaos.run_log import RunLog, RunRecorder
 from cpcbl_launch.lab.experiments.runs import with_settings
 from cpcbl_launch.lab.faulty_robot import faulty_command
+from cpcbl_launch.recordings.read import BUS
 from cpcbl_launch.run.processes import PROGRAM, ProcessSpec, Supervisor, process_table
 from cpcbl_launch.run.up import free_endpoint
 from cpcbl_launch.team.file import builtin_path, load_team, save_resolved
@@ -53,6 +54,7 @@ class RunPlan(NamedTuple):
     secured: bool = False  # with keys: mutual TLS and access control
     guests: Sequence[str] = ()  # observers that get keys in a secured team
     watched: bool = False  # with a process that records it, as `up --record` does
+    recordings: Path | None = None  # where each robot records, and that process, if there is one
 
 
 def secured_plan(plan: RunPlan, folder: Path) -> RunPlan:
@@ -132,12 +134,14 @@ class TeamUnderTest:
         for name in (name for name in plan.team.robots if name not in plan.left_out):
             link = self.links.get(name)
             endpoint = link.endpoint if link else self._router_of(name)
-            own = process_table(*settings, endpoint, self.clock, seed, here=(name,))[-1]
+            record = str(plan.recordings or "")
+            own = process_table(*settings, endpoint, self.clock, seed, (name,), record)[-1]
             fault = plan.faults.get(name)
             command = faulty_command(own.command, fault) if fault else own.command
             rows.append(own._replace(command=(*(link.prefix if link else ()), *command)))
         if plan.watched:
-            words = (team_file, self.endpoint, self.folder / "run.mcap", os.getpid())
+            record_file = (plan.recordings or self.folder) / BUS
+            words = (team_file, self.endpoint, record_file, os.getpid())
             rows.append(ProcessSpec(UP, (sys.executable, "-m", WATCHER, *map(str, words))))
         return rows
 
