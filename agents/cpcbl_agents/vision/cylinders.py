@@ -27,6 +27,7 @@ from cpcbl_agents.vision.cylinder_fit import (
 from cpcbl_agents.vision.detections import Ambiguity, Detection, Detections, without_duplicates
 from cpcbl_agents.vision.landmark_doubts import LandmarkDoubts
 from cpcbl_agents.vision.outlines import (
+    FARTHEST_PX,
     GAP_PX,
     Candidate,
     Outline,
@@ -92,10 +93,13 @@ class CylinderDetector:
             return Ambiguity("too_small", names, pair.outline)
         outlines = self._angular_outlines(pixels, pair)
         fits = {kind: _best_fit(kind.shape, outlines) for kind in kinds}
-        if all(fit is None or fit.hidden is not None for fit in fits.values()):
-            # A shadow line may have been taken for an edge.
-            outlines += self._angular_outlines(pixels, pair, in_shadow=True)
-            fits = {kind: _best_fit(kind.shape, outlines) for kind in kinds}
+        if not any(map(_is_complete, fits.values())) and _is_wide(pair):
+            # A shadow line may have been taken for an edge. The bands of a mast are so low that an
+            # edge by colour alone can be wrong and still fit.
+            shaded = self._angular_outlines(pixels, pair, in_shadow=True)
+            found = {k: _best_fit(k.shape, shaded) for k in kinds if not k.shape.rim}
+            if complete := {kind: fit for kind, fit in found.items() if _is_complete(fit)}:
+                outlines, fits = outlines + shaded, fits | complete
         accepted = [fit for fit in fits.values() if fit is not None]
         if not accepted:
             return Ambiguity(self._rejection_reason(kinds, outlines), names, pair.outline)
@@ -241,6 +245,15 @@ def from_robot_centre(lens: tuple[float, float], angles: PolarPosition) -> Polar
 
 def _names(kinds: Iterable[CylinderKind]) -> tuple[str, ...]:
     return tuple(name for kind in kinds for name in kind.names)
+
+
+def _is_complete(fit: CylinderFit | None) -> bool:
+    return fit is not None and fit.hidden is None
+
+
+def _is_wide(pair: Candidate) -> bool:
+    """Whether the colours at both sides of a band are not taken from the same pixels."""
+    return min(pair.upper.width, pair.lower.width) >= 2.0 * FARTHEST_PX
 
 
 def _best_fit(
