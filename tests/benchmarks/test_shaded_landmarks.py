@@ -10,6 +10,8 @@ from benchmarks.degraded_frames import textures
 from benchmarks.landmark_frames import LIGHTS, LightKind
 from benchmarks.shaded_landmarks import false_landmarks, printed, shaded_landmarks
 
+from cpcbl_agents.vision import cylinders
+
 FRAMES = 16
 
 
@@ -22,6 +24,17 @@ def test_landmarks_in_any_light_are_ranged_and_none_is_wrong(light: LightKind) -
         off, sigmas = np.abs(np.array(errors)).T
         assert (off < 4.0 * sigmas).all()
     assert printed([score]).row_count == 1
+
+
+def test_edges_by_colour_alone_find_landmarks_that_a_shadow_line_crosses(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    pictures = textures(6, np.random.default_rng(3))
+    found = shaded_landmarks("vertical edge", FRAMES, pictures, seed=4)
+    monkeypatch.setattr(cylinders, "_is_wide", lambda pair: False)
+    without = shaded_landmarks("vertical edge", FRAMES, pictures, seed=4)
+    assert found.ranged > without.ranged
+    assert found.wrong == without.wrong == 0
 
 
 def test_no_landmark_is_in_pictures_without_one() -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from cpcbl_agents.vision.camera import Floats
-from cpcbl_agents.vision.outlines import Profile
+from cpcbl_agents.vision.outlines import Profile, _possible_sides
 
 WALL, RED = np.array([140.0, 142.0, 138.0]), np.array([40.0, 35.0, 205.0])
 
@@ -64,3 +64,19 @@ def test_the_nearest_of_two_edges() -> None:
     )
     assert Profile(two, 0.0).edge(14.8, 2.5, 2.5) == pytest.approx(14.0, abs=0.1)
     assert Profile(two, 0.0).edge(19.2, 2.5, 2.5) == pytest.approx(20.0, abs=0.1)
+
+
+@pytest.mark.parametrize(
+    ("lower", "is_one"),
+    [
+        ((13.0, 33.0), True),  # shifted alike, by a camera that leans
+        ((11.0, 31.0), True),
+        ((13.0, 30.0), False),  # one side only: something is in front of it
+        ((17.0, 37.0), False),  # farther than any camera leans
+    ],
+)
+def test_bands_that_are_shifted_alike_have_one_pair_of_sides(
+    lower: tuple[float, float], is_one: bool
+) -> None:
+    found = _possible_sides((10.0, 30.0), lower, leaning=2.0)
+    assert (len(found) == 1) == is_one
