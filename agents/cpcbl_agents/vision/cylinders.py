@@ -76,7 +76,7 @@ class CylinderDetector:
             return Detections()
         blobs = self._colours.blobs(pixels, self._panorama)
         pairs = candidates(blobs)
-        identified = [self._identify(pixels, pair) for pair in pairs]
+        identified = _without_shared_bands(pairs, [self._identify(pixels, pair) for pair in pairs])
         found = tuple(one for one in identified if isinstance(one, Detection))
         ambiguities = tuple(one for one in identified if isinstance(one, Ambiguity))
         self.doubts.add(len(found), ambiguities)
@@ -245,6 +245,27 @@ def from_robot_centre(lens: tuple[float, float], angles: PolarPosition) -> Polar
 
 def _names(kinds: Iterable[CylinderKind]) -> tuple[str, ...]:
     return tuple(name for kind in kinds for name in kind.names)
+
+
+def _without_shared_bands(
+    pairs: Sequence[Candidate], identified: Sequence[Detection | Ambiguity]
+) -> list[Detection | Ambiguity]:
+    """The same, but a band of a cylinder with a range belongs to no other one, of which a part is
+    hidden: that one becomes an ambiguity."""
+    ranged = {
+        id(band)
+        for pair, one in zip(pairs, identified, strict=True)
+        if isinstance(one, Detection) and one.sighting.range_m is not None
+        for band in (pair.upper, pair.lower)
+    }
+
+    def verdict_on(pair: Candidate, one: Detection | Ambiguity) -> Detection | Ambiguity:
+        is_shared = not ranged.isdisjoint((id(pair.upper), id(pair.lower)))
+        if is_shared and isinstance(one, Detection) and one.sighting.range_m is None:
+            return Ambiguity("ambiguous", (one.sighting.id,), pair.outline)
+        return one
+
+    return [verdict_on(pair, one) for pair, one in zip(pairs, identified, strict=True)]
 
 
 def _is_complete(fit: CylinderFit | None) -> bool:
