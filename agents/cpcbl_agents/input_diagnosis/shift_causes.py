@@ -282,8 +282,8 @@ def _fitted(points: Sequence[Point], unsure: _Unsure) -> tuple[Shift, float, int
     free = 2 * len(points) - 2 * len({p.name for p in points}) - FITTED
     spread = scale * math.sqrt(2 * len(points) / max(free, 1))
     inflation = max(spread, 1.0) ** 2 * _repetition(points, residuals, unsure)
-    of_drift = unsure.drift_rad * _of_drift(points, terms, weights, sums.x)
-    shift = sums.shift(inflation, of_drift)
+    drifts = [unsure.drift_rad * 1j * p.progress * p.place for p in points]
+    shift = sums.shift(inflation, weights, _centred(drifts, weights, terms.of_landmarks))
     return shift, scale, sum(far < CUT * scale for far in off)
 
 
@@ -325,20 +325,25 @@ class _Sums(NamedTuple):
 
     def solved(self) -> tuple[complex, float]:
         """g and e."""
-        e = (self.zq - (self.xz.conjugate() * self.xq).real / self.xx) / self._of_turn
-        return (e * self.xz - self.xq) / self.xx, e
+        return self._solution(self.xq, self.zq)
+
+    def _solution(self, xq: complex, zq: float) -> tuple[complex, float]:
+        e = (zq - (self.xz.conjugate() * xq).real / self.xx) / self._of_turn
+        return (e * self.xz - xq) / self.xx, e
 
     def residuals(self) -> list[complex]:
         g, e = self.solved()
         return [b + g * a - e * c for a, b, c in zip(self.x, self.q, self.z, strict=True)]
 
-    def shift(self, inflation: float, of_drift: complex) -> Shift:
-        """What was found; `inflation`: of all variances, `of_drift`: Σ w x* d for d = what a
-        drift of the heading shifts."""
+    def shift(self, inflation: float, weights: Sequence[float], drifts: Sequence[complex]) -> Shift:
+        """What was found; `inflation`: of all variances, `drifts`: by how much a drift of the
+        heading shifts each point, which looks like a gain and a scale of turns."""
         g, e = self.solved()
+        xd, zd = _products(self.x, drifts, weights), _products(self.z, drifts, weights)
+        drift_gain, drift_turn = self._solution(xd, zd.real)
         sigma = math.sqrt(inflation / self._of_turn)
-        along = sigma * self.xz / self.xx, of_drift / self.xx
-        return Shift(g, 1.0 - e, sigma, inflation / self.xx, along, self.most_turn_rad)
+        along, turn_sigma = (sigma * self.xz / self.xx, drift_gain), math.hypot(sigma, drift_turn)
+        return Shift(g, 1.0 - e, turn_sigma, inflation / self.xx, along, self.most_turn_rad)
 
 
 class _Terms(NamedTuple):
@@ -370,11 +375,8 @@ def _sums(terms: _Terms, weights: Sequence[float]) -> _Sums | None:
     if xx <= 0.0:
         return None
     zz = sum([w * abs(c) ** 2 for w, c in zip(weights, z, strict=True)]) + TURN_SIGMA**-2
-    wx = [w * a.conjugate() for w, a in zip(weights, x, strict=True)]
-    xz = sum([a * c for a, c in zip(wx, z, strict=True)], 0j)
-    xq = sum([a * b for a, b in zip(wx, q, strict=True)], 0j)
-    zq = sum([(w * c.conjugate() * b).real for w, c, b in zip(weights, z, q, strict=True)])
-    return _Sums(q, x, z, xx, zz, xz, xq, zq, terms.most_turn_rad)
+    xz, xq = _products(x, z, weights), _products(x, q, weights)
+    return _Sums(q, x, z, xx, zz, xz, xq, _products(z, q, weights).real, terms.most_turn_rad)
 
 
 def _centred(
@@ -389,10 +391,8 @@ def _centred(
     return centred
 
 
-def _of_drift(
-    points: Sequence[Point], terms: _Terms, weights: Sequence[float], x: Sequence[complex]
+def _products(
+    values: Sequence[complex], others: Sequence[complex], weights: Sequence[float]
 ) -> complex:
-    """Σ w x* d with d = i q times the progress: what a heading shifts that drifts by one radian in
-    all that time."""
-    d = _centred([1j * p.progress * p.place for p in points], weights, terms.of_landmarks)
-    return sum([w * a.conjugate() * c for w, a, c in zip(weights, x, d, strict=True)], 0j)
+    """Σ w a* b."""
+    return sum([w * a.conjugate() * b for w, a, b in zip(weights, values, others, strict=True)], 0j)
