@@ -25,9 +25,9 @@ from benchmarks.degraded_frames import (
     SIDES,
     Degraded,
     Pixels,
-    background,
     degraded_frame,
     marker_ratio,
+    natural_frame,
 )
 from benchmarks.landmark_frames import LIGHTS
 from benchmarks.photographs import tags_read
@@ -142,9 +142,7 @@ def false_markers(
     detector = CameraDetector("me", team)
     false = 0
     for _ in range(frames):
-        levels = background(backgrounds, random, settings) * random.uniform(0.2, 1.1)
-        noisy = levels + random.normal(0.0, random.uniform(0.0, 4.0), levels.shape)
-        found = detector.detections(noisy.clip(0, 255).astype(np.uint8))
+        found = detector.detections(natural_frame(backgrounds, random, settings))
         if isinstance(found, Detections):
             false += len(found.found) + len(found.ambiguities)
     return false

@@ -184,6 +184,13 @@ def background(backgrounds: Sequence[Pixels], random: Random, s: CameraSettings)
     return part.astype(np.float32)
 
 
+def natural_frame(backgrounds: Sequence[Pixels], random: Random, s: CameraSettings) -> Pixels:
+    """A random part of a picture as a frame, in any brightness and with noise."""
+    levels = background(backgrounds, random, s) * random.uniform(0.2, 1.1)
+    noisy = levels + random.normal(0.0, random.uniform(0.0, 4.0), levels.shape)
+    return noisy.clip(0, 255).astype(np.uint8)
+
+
 def _paste(levels: Levels, pattern: Pattern, corners: NDArray[np.float64], random: Random) -> None:
     """Draws the marker's paper into the levels (height, width, 3), every pixel as the mean of what
     it shows. `corners`: of the pattern's quad."""

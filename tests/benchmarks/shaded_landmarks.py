@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from benchmarks.degraded_frames import Pixels, background
+from benchmarks.degraded_frames import Pixels, natural_frame
 from benchmarks.landmark_frames import LIGHTS, LightKind, Lit, landmark_frame
 from msgspec.structs import replace
 from rich.table import Table
@@ -88,10 +88,7 @@ def false_landmarks(backgrounds: Sequence[Pixels], frames: int, seed: int = 1) -
     detector, random = CameraDetector(VIEWERS[0], eyes()), np.random.default_rng(seed)
     named = ranged = 0
     for _ in range(frames):
-        levels = background(backgrounds, random, detector.camera.settings)
-        noisy = levels * random.uniform(0.2, 1.1)
-        noisy += random.normal(0.0, random.uniform(0.0, 4.0), levels.shape)
-        found = detector.detections(noisy.clip(0, 255).astype(np.uint8))
+        found = detector.detections(natural_frame(backgrounds, random, detector.camera.settings))
         if isinstance(found, Detections):
             named += len(found.sightings)
             ranged += sum(one.range_m is not None for one in found.sightings)

@@ -94,7 +94,7 @@ class Driven:
         return eventually(is_said, PATIENCE_S)
 
     def says_no_more(self, text: str, images: Sequence[bytes]) -> bool:
-        """Whether its status stops to say this while it receives these images again and again."""
+        """Whether its status no longer says this while it receives these images again and again."""
 
         def is_gone() -> bool:
             self._show(images)
