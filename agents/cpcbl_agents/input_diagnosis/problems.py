@@ -77,8 +77,7 @@ REASONS = {
 """What each reason of a refused input says to people; docs/refused_inputs.md has the remedies."""
 
 STAMPS = {"from_the_future", "too_late", "impossible_duration", "implausible_number"}
-
-
+SAID_BY_CAMERA = {"camera_upside_down"}  # with the numbers of what it saw
 MOTION, OVERLAP, POSITION = "motion", "overlap", "position"  # what implausible inputs are about
 CALIBRATION = "calibration"
 
@@ -184,10 +183,11 @@ def _refusal_problems(name: str, window: InputWindow, facts: InputFacts) -> Iter
     total = window.taken + sum(window.refused.values())
     if is_often_refused(window):
         by_cause = Counter[str]()
-        for reason, refused in window.refused.items():
-            by_cause[_refusal_cause(reason, f"in/{facts.robot}/{name}", window, facts)] += refused
-        worst, *others = by_cause.most_common(2)
-        for cause, refused in (worst, *(o for o in others if o[1] > REFUSED_SHARE * total)):
+        for reason in (r for r in window.refused if r not in SAID_BY_CAMERA):
+            cause = _refusal_cause(reason, f"in/{facts.robot}/{name}", window, facts)
+            by_cause[cause] += window.refused[reason]
+        first = by_cause.most_common(2)
+        for cause, refused in first[:1] + [o for o in first[1:] if o[1] > REFUSED_SHARE * total]:
             yield f"{100.0 * refused / total:.0f} % of {name} refused: {cause}"
     elif cause := causes.arrival_cause(_times(window)):
         yield f"{name}: {cause}"
