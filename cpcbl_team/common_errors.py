@@ -21,7 +21,7 @@ from cpcbl_team.camera_errors import (
     sigmas_of,
     without_errors,
 )
-from cpcbl_team.estimate import ZERO3, Estimate, Row, dot
+from cpcbl_team.estimate import ZERO3, Estimate, Matrix3, Row, dot
 from cpcbl_team.gaussian import Covariance2, Gaussian2
 from cpcbl_team.inputs import Sighting
 from cpcbl_team.motion import motion_jacobian
@@ -156,6 +156,10 @@ class CommonErrors(NamedTuple):
         """After a motion from this heading (rad): the pose's error is led on (m, rad)."""
         _, _, to_x, _, _, to_y, _, _, _ = motion_jacobian(heading, distance, turn)
         return self._replace(parameters=self.parameters.after_motion(to_x, to_y))
+
+    def with_pose_mapped(self, m: Matrix3) -> "CommonErrors":
+        """With a pose whose error is led on by this matrix."""
+        return self._replace(parameters=self.parameters.with_pose_mapped(m))
 
     def after_time(self, seconds: float) -> "CommonErrors":
         """After this time, in which the camera may have been knocked."""

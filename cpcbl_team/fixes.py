@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 from msgspec.structs import replace
 
+from cpcbl_team.arcs import arc_variance
 from cpcbl_team.common_errors import CommonErrors
 from cpcbl_team.config import SensorSettings
 from cpcbl_team.estimate import Estimate
@@ -117,15 +118,6 @@ def arc_width(bearing_sigma: float) -> float:
     """The sigma along the line of sight, in metres a metre of range, of a bearing that errs: that
     of cos e, of a Gaussian e."""
     return -math.sqrt(0.5) * math.expm1(-(bearing_sigma**2))
-
-
-def arc_variance(heading_variance: float) -> float:
-    """The mean square by which a point at distance 1 comes nearer when its direction turns.
-
-    E[(1 - cos e)^2] of a Gaussian e, by E[cos n e] = exp(-n^2 variance / 2); about 3/4 of the
-    square of the variance while that is small.
-    """
-    return -2.0 * math.expm1(-0.5 * heading_variance) + 0.5 * math.expm1(-2.0 * heading_variance)
 
 
 def with_sensor_factor(fix: Fix, factor: float) -> Fix:

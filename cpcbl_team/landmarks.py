@@ -132,11 +132,14 @@ class Landmarks:
         scope: Scope | None,
         unusable: frozenset[str],
         recorded: frozenset[str],
+        none_is_plain: bool = False,
     ) -> LandmarkUpdate:
         """What the landmarks among `sightings` say about position or heading, or about both. One
         of the `unusable` objects is not plain; one of `recorded` is no new evidence."""
         update, marks = LandmarkUpdate(state), self._marks
-        if unusable:
+        if none_is_plain:
+            marks = {}
+        elif unusable:
             marks = {name: mark for name, mark in marks.items() if name not in unusable}
         uses_range = scope is not None and scope is not HEADING
         uses_bearing = scope is not None and (scope is not POSITION or self._uses_rays)

@@ -7,11 +7,11 @@ from collections.abc import Iterable
 from typing import Final
 
 from cpcbl_team.common_error_filter import common_error_filter
-from cpcbl_team.common_errors import CommonErrors
 from cpcbl_team.config import CameraSettings, Field, LocalizationSettings
 from cpcbl_team.estimate import HEADING, POSE, POSITION, Estimate, Scope
 from cpcbl_team.fixes import PoseObservation, from_fix, from_position_sensor
 from cpcbl_team.fusion import chi_square_bounds, mark_shared
+from cpcbl_team.gate import Gate
 from cpcbl_team.geometry import new
 from cpcbl_team.initial_pose import estimate_of
 from cpcbl_team.inputs import (
@@ -32,9 +32,6 @@ from cpcbl_team.measurements import (
     GatedObjects,
     Measurement,
     constrains,
-    constraints_of,
-    curved,
-    gated_object,
     measurement_of,
 )
 from cpcbl_team.mended_inputs import with_mended_inputs
@@ -50,6 +47,7 @@ from cpcbl_team.recovery_evidence import (
     with_measurements,
     with_snapshot,
 )
+from cpcbl_team.relinearization import Relinearization
 from cpcbl_team.sensors import sighting_fault
 from cpcbl_team.state import (
     LandmarkSnapshot,
@@ -89,12 +87,13 @@ class Localizer:
         self._rules, self._gates = rules, gates
         self._has_map = field.has_surveyed
         self._minimum_interval_ns = rules.minimum_interval_s * 1e9
-        self._widens = rules.variant != "weighted" and not rules.paper_uncertainty
         self._window = rules.lost_window
         self._belief_age_ns = int(settings.collaboration.max_age_s * 1e9)
         self._timers = ObjectTimers(settings)
         self._variant = variant_of(settings, field)
         self._common = common_error_filter(settings, field, camera)
+        self._relinearization = Relinearization(settings, gates, self._common)
+        self._gate = Gate(settings, gates, self._relinearization)
         self._landmarks = Landmarks(field, settings, gates, self._common is not None)
         self._calibration = OwnCalibration(settings, field, self._landmarks)
         self._prediction = Prediction(settings, self._variant, self._calibration, self._common)
@@ -116,7 +115,7 @@ class Localizer:
             return self.recovery.check(state)
         gated = _NO_OBJECTS
         if others:
-            gated = self.constrain(state.estimate, others, scope, state.common_errors)
+            state, gated = self._gate.constrain(state, others, scope)  # 3. constraints
         if self.screen.is_due(state, gated):  # beyond the paper: trust
             state, gated = self.screen.screen_frame(state, landmarks, gated)
         prior = state.estimate
@@ -154,8 +153,11 @@ class Localizer:
         recovery = state.memory.recovery
         recorded = recently_recorded(recovery, stamp_ns)
         unusable = self._timers.unusable(state, now)
+        is_bent = self._relinearization.is_due(state)
         for scope in self._update_order(state):
-            landmarks = self._landmarks.update(state, frame.sightings, scope, unusable, recorded)
+            landmarks = self._landmarks.update(
+                state, frame.sightings, scope, unusable, recorded, is_bent
+            )
             measured: list[Measurement] = []
             faults: list[str] = []
             if landmarks.others:
@@ -222,27 +224,7 @@ class Localizer:
                 measured.append(m if factor == 1.0 else m.inflated(factor))
         return state, measured, faults
 
-    # Steps 3 to 5 -----------------------------------------------------------------------------
-
-    def constrain(
-        self,
-        prior: Estimate,
-        measurements: list[Measurement],
-        scope: Scope,
-        common: CommonErrors | None = None,
-    ) -> GatedObjects:
-        """Step 3: the constraints of each object, accepted or rejected by the chi-square bound of
-        their innovation at the prior."""
-        gated = GatedObjects([], [])
-        for m in sorted(measurements, key=_source):
-            constraints = constraints_of(prior.pose, m, scope, self._rules)
-            if self._widens and not m.is_dependent:
-                constraints = curved(prior, m, constraints)
-            if constraints:
-                found = gated_object(prior, m, constraints, common)
-                is_accepted = found.nis <= self._gates[len(constraints) - 1]
-                (gated.accepted if is_accepted else gated.rejected).append(found)
-        return gated
+    # Steps 4 and 5 ----------------------------------------------------------------------------
 
     def correct(
         self, prior: Estimate, landmarks: LandmarkUpdate, gated: GatedObjects, scope: Scope
@@ -392,7 +374,3 @@ class Localizer:
         """The state at the start: at the configured pose, or lost somewhere on the field."""
         state = state_at_start(stamp_ns, self.settings.start, self.field)
         return state if self._common is None else self._common.started(state)
-
-
-def _source(m: Measurement) -> str:
-    return m.source

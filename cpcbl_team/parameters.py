@@ -8,7 +8,7 @@ Application of state-space methods to navigation problems, 1966).
 
 from typing import NamedTuple
 
-from cpcbl_team.estimate import Row
+from cpcbl_team.estimate import Matrix3, Row
 from cpcbl_team.geometry import new
 
 Sensitivity = tuple[tuple[int, float], ...]
@@ -41,6 +41,15 @@ class Parameters(NamedTuple):
         """After a motion that makes an error of the heading one of the position: (m/rad)."""
         rows = tuple([(a + to_x * g, b + to_y * g, g) for a, b, g in self.with_pose])
         return new(Parameters, (self.covariance, rows))
+
+    def with_pose_mapped(self, m: Matrix3) -> "Parameters":
+        """With a pose whose error is led on by this matrix."""
+        a, b, c, d, e, f, g, h, i = m
+        rows = tuple(
+            (a * x + b * y + c * t, d * x + e * y + f * t, g * x + h * y + i * t)
+            for x, y, t in self.with_pose
+        )
+        return Parameters(self.covariance, rows)
 
     def inflated(self, k: float) -> "Parameters":
         """With covariances times this factor."""

@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
+from cpcbl_team.arcs import with_arc_width
 from cpcbl_team.common_errors import CommonErrors
 from cpcbl_team.config import Field, Start
 from cpcbl_team.estimate import HEADING, POSE, POSITION, ZERO3, Covariance3, Estimate, Scope
@@ -232,7 +233,7 @@ class State(NamedTuple):
     @property
     def reported(self) -> Estimate:
         """The estimate as it is belief to others: as uncertain as the settings are, too."""
-        return with_doubts(self.estimate, self.memory.calibration.check)
+        return with_doubts(with_arc_width(self.estimate), self.memory.calibration.check)
 
     @property
     def common_errors(self) -> CommonErrors | None:

@@ -18,10 +18,10 @@ from support.core import (
 )
 from support.standing import FORMULAS
 
+from cpcbl_team.arcs import arc_variance
 from cpcbl_team.config import Field, OdometrySettings, SensorSettings
 from cpcbl_team.estimate import Estimate
 from cpcbl_team.fixes import (
-    arc_variance,
     arc_width,
     fix_for,
     unbiased_range_m,

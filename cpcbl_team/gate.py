@@ -1,0 +1,62 @@
+"""Step 3 of the cycle, the general path: the constraints of each object, accepted or rejected."""
+
+from collections.abc import Iterable
+
+from cpcbl_team.config import LocalizationSettings
+from cpcbl_team.constraints import Constraint
+from cpcbl_team.estimate import Estimate, Scope
+from cpcbl_team.measurements import (
+    GatedObjects,
+    Measurement,
+    constraints_of,
+    curved,
+    gated_object,
+)
+from cpcbl_team.relinearization import Linearization, Relinearization
+from cpcbl_team.state import State
+
+AMBIGUOUS = "ambiguous"
+"""Counted when two poses agree with what a robot with an uncertain heading measures."""
+
+
+class Gate:
+    """The constraints of what one robot measures, and which of them are used."""
+
+    def __init__(
+        self,
+        settings: LocalizationSettings,
+        gates: tuple[float, float],
+        relinearization: Relinearization,
+    ) -> None:
+        """`gates`: chi-square bounds of one and of two constraints."""
+        self._rules = rules = settings.localizer
+        self._gates, self._relinearization = gates, relinearization
+        self._widens = rules.variant != "weighted" and not rules.paper_uncertainty
+
+    def constrain(
+        self, state: State, measurements: Iterable[Measurement], scope: Scope
+    ) -> tuple[State, GatedObjects]:
+        """The constraints of each object, accepted or rejected by the chi-square bound of their
+        innovation, and the state about whose estimate they are linear. Where two poses agree with
+        the measurements of a robot with an uncertain heading, none is used."""
+        measured = sorted(measurements, key=lambda m: m.source)
+        found = self._relinearization.about_best_pose(state, measured)
+        if found is None:
+            return state.counted(AMBIGUOUS), GatedObjects([], [])
+        after, about = found
+        prior, gated = after.estimate, GatedObjects([], [])
+        for m in measured:
+            constraints = self._constraints(prior, m, scope, about)
+            if constraints:
+                result = gated_object(prior, m, constraints, after.common_errors)
+                is_accepted = result.nis <= self._gates[len(constraints) - 1]
+                (gated.accepted if is_accepted else gated.rejected).append(result)
+        return (after if gated.accepted else state), gated
+
+    def _constraints(
+        self, prior: Estimate, m: Measurement, scope: Scope, about: Linearization | None
+    ) -> list[Constraint]:
+        if about is not None:
+            return about.constraints_of(prior, m, self._rules)
+        constraints = constraints_of(prior.pose, m, scope, self._rules)
+        return curved(prior, m, constraints) if self._widens and not m.is_dependent else constraints

@@ -1,0 +1,169 @@
+"""Where the measurements of a robot with an uncertain heading are linearized.
+
+They are linearized at the pose that fits them best, along the arc of the prior (`arcs.py`), and the
+prior is expressed as a Gaussian on the tangent there. So all that follows is linear, as it is for a
+robot that knows its heading.
+"""
+
+import math
+from collections.abc import Iterable
+from typing import Final, NamedTuple
+
+from cpcbl_team.arc_fit import ArcFit, Measure, Scalar, best_fit, least_cost
+from cpcbl_team.arcs import Arc, square_root
+from cpcbl_team.common_error_filter import CommonErrorFilter
+from cpcbl_team.config import LocalizationSettings, LocalizerSettings
+from cpcbl_team.constraints import Constraint, curved_variance
+from cpcbl_team.estimate import POSE, ZERO3, Estimate, Row, dot
+from cpcbl_team.geometry import Pose2, wrap_angle
+from cpcbl_team.measurements import Measurement, constraints_of
+from cpcbl_team.state import State, with_common_errors
+
+BENT_VARIANCE: Final = math.radians(5.0) ** 2  # of the heading: above, tangents are no arcs
+NEARLY_KNOWN: Final = 0.2
+"""The ratio of the offset's variance to what the turn adds to that of the position, and to the
+squared distance of an object, below which no more than the turn is uncertain."""
+
+
+class Linearization(NamedTuple):
+    """A pose on the prior's arc about which measurements are linear."""
+
+    arc: Arc
+    fit: ArcFit
+
+    def constraints_of(
+        self, prior: Estimate, m: Measurement, rules: LocalizerSettings
+    ) -> list[Constraint]:
+        """The constraints on an object with residuals about the mean of `prior`, which is about the
+        tangent here; each as wide as its linear form is right."""
+        offset = self.arc.tangent_offset(self.fit.offset)
+        constraints = constraints_of(self.arc.at(self.fit.offset), m, POSE, rules)
+        left_out = (0.0,) * len(constraints) if m.is_dependent else self._left_out(m, rules)
+        found = []
+        for c, square in zip(constraints, left_out, strict=True):
+            predicted = dot(c.row, prior.covariance.times(c.row))
+            sigma = math.sqrt(curved_variance(c.sigma * c.sigma, predicted, square))
+            found.append(c._replace(residual=c.residual + dot(c.row, offset), sigma=sigma))
+        return found
+
+    def _left_out(self, m: Measurement, rules: LocalizerSettings) -> list[float]:
+        """The mean square of what each linear constraint leaves out where the pose may be after all
+        measurements: E[(e^T M e / 2)^2] = (tr(M)^2 + 2 |M|^2) / 4 of a normal e, with second
+        differences M along the columns of a square root of the covariance."""
+        a, b, c = square_root(self.fit.covariance)
+        pairs = _sum(a, b), _sum(a, c), _sum(b, c)
+        along = [self._second_differences(direction, m, rules) for direction in (a, b, c, *pairs)]
+        squares = []
+        for aa, bb, cc, ab, ac, bc in zip(*along, strict=True):
+            mixed = ((ab - aa - bb) ** 2 + (ac - aa - cc) ** 2 + (bc - bb - cc) ** 2) / 4.0
+            norm = aa * aa + bb * bb + cc * cc + 2.0 * mixed
+            squares.append(0.25 * ((aa + bb + cc) ** 2 + 2.0 * norm))
+        return squares
+
+    def _second_differences(self, by: Row, m: Measurement, rules: LocalizerSettings) -> list[float]:
+        """Of the residual of each constraint, in its unit, when the offset moves by this."""
+        x, y, turn = self.fit.offset
+        before, here, after = (
+            constraints_of(
+                self.arc.at((x + k * by[0], y + k * by[1], turn + k * by[2])), m, POSE, rules
+            )
+            for k in (-1.0, 0.0, 1.0)
+        )
+        return [_second_difference(*beside) for beside in zip(before, here, after, strict=True)]
+
+
+def _sum(a: Row, b: Row) -> Row:
+    return a[0] + b[0], a[1] + b[1], a[2] + b[2]
+
+
+def _second_difference(before: Constraint, here: Constraint, after: Constraint) -> float:
+    """Of the residuals of a constraint, in its unit."""
+    steps = before.residual - here.residual, after.residual - here.residual
+    return sum(map(wrap_angle, steps) if here.on_heading else steps)
+
+
+class Relinearization:
+    """Finds where the measurements of one robot are linearized."""
+
+    def __init__(
+        self,
+        settings: LocalizationSettings,
+        gates: tuple[float, float],
+        common: CommonErrorFilter | None,
+    ) -> None:
+        """`gates`: chi-square bounds of one and of two constraints. `common`: the errors that
+        depend on those of the pose."""
+        self._rules, self._gates, self._common = settings.localizer, gates, common
+        rules = settings.localizer
+        self._is_used = rules.variant == "joint" and not (
+            rules.alternates or rules.paper_uncertainty
+        )
+
+    def is_due(self, state: State) -> bool:
+        """Whether the estimate is a Gaussian along an arc only. (That of a robot that rejects what
+        it measures is a doubt, and no arc.)"""
+        memory = state.memory.recovery
+        is_doubt = memory.suspected_ns >= 0 or memory.kidnapped_ns >= 0
+        return self._is_used and state.estimate.covariance.hh > BENT_VARIANCE and not is_doubt
+
+    def about_best_pose(
+        self, state: State, measurements: Iterable[Measurement]
+    ) -> tuple[State, Linearization | None] | None:
+        """The state with its prior about the pose that fits the objects of the map best, and that
+        pose; None if another pose fits nearly as well. The state as it is, and no pose, where its
+        estimate is no arc, or these objects leave none."""
+        objects = [m for m in measurements if not m.sender]
+        if not objects or not self.is_due(state):
+            return state, None
+        arc = Arc.of(state.estimate)
+        if not all(_leaves_arc(arc, m) for m in objects):
+            return state, None
+        accepted: list[Measure] = []
+        for m in objects:
+            measure = self._measure(state, m)
+            gate = self._gates[len(measure(arc.pose)) > 1]
+            if least_cost(arc, measure, gate) <= gate:
+                accepted.append(measure)
+        fit = best_fit(arc, lambda pose: [s for measure in accepted for s in measure(pose)])
+        return None if fit is None else (_about(state, arc, fit.offset), Linearization(arc, fit))
+
+    def _measure(self, state: State, m: Measurement) -> Measure:
+        """What an object says, with the errors of its place and of the camera as noise."""
+        place = m.position.covariance
+        if self._common is not None:
+            place += self._common.place_covariance(state, m)
+            m = self._common.as_evidence(state, m)
+
+        def measure(pose: Pose2) -> list[Scalar]:
+            return [
+                (c.row, c.residual, c.sigma * c.sigma + place.along(*c.place_row))
+                for c in constraints_of(pose, m, POSE, self._rules)
+            ]
+
+        return measure
+
+
+def _leaves_arc(arc: Arc, m: Measurement) -> bool:
+    """Whether what an object says leaves a pose on an arc. Range and bearing to one point leave
+    nothing but a turn about it undetermined, whatever the prior is; other ones leave other curves
+    where more than the turn is uncertain."""
+    if m.range_m is not None and m.bearing is not None and m.wall is None:
+        return True
+    xx, _, yy, _, _, hh = arc.covariance
+    apart, by_turn = xx + yy, hh * (arc.x * arc.x + arc.y * arc.y)
+    dx, dy = m.position.x - arc.pose.x, m.position.y - arc.pose.y
+    return apart <= NEARLY_KNOWN * min(dx * dx + dy * dy, by_turn)
+
+
+def _about(state: State, arc: Arc, offset: Row) -> State:
+    """The state with its prior on the tangent at this offset along the arc."""
+    if offset == (0.0, 0.0, 0.0):
+        return state
+    prior, there = state.estimate, arc.at(offset)
+    (dx, dy, turn), moved = arc.tangent_offset(offset), arc.tangent_map(offset)
+    mean = Pose2(there.x - dx, there.y - dy, wrap_angle(there.heading - turn))
+    shared = prior.shared if prior.shared is ZERO3 else prior.shared.transformed(moved)
+    state = state._replace(estimate=Estimate(mean, prior.covariance.transformed(moved), shared))
+    if (common := state.common_errors) is not None:
+        state = with_common_errors(state, common.with_pose_mapped(moved))
+    return state
