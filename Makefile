@@ -86,7 +86,7 @@ test-docker: setup
 
 # Every fault scenario; those that need root or Docker say so where there is none.
 chaos: setup
-	$(BIN)/cpcbl-team chaos all --retries 1
+	$(BIN)/cpcbl-team chaos all --retries 1 --at-once 3
 
 # The net proves that a refactoring changes no bit; see tests/net/test_net.py.
 net: setup
