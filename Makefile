@@ -71,13 +71,14 @@ $(READERS)/ready: tests/recordings/partners.txt
 	$(READERS)/bin/python -m pip install --quiet --disable-pip-version-check -r $<
 	@touch $@
 
-# What a new user does, with a browser; needs Chromium (Debian: apt-get install chromium).
+# What a new user does, with a browser; needs Chromium (Debian: apt-get install chromium). By file: one
+# has a team that all of its tests share, another one fixed ports.
 test-trial: setup
-	$(BIN)/pytest -m trial
+	$(BIN)/pytest -n 2 --dist loadfile -m trial
 
 # The core's tests with its hot files compiled, and that they say the same.
 test-compiled: compiled
-	$(BIN)/pytest -o pythonpath="$(COMPILED) agents transport launch tests" tests/core
+	$(BIN)/pytest -o pythonpath="$(COMPILED) agents transport launch tests" -n 2 tests/core
 	$(BIN)/pytest tests/benchmarks/test_compiled.py
 
 # Needs a Docker daemon: docker/dockerd.sh start. One at a time: containers share the machine.
