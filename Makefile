@@ -37,7 +37,7 @@ quick: setup
 check: setup
 	$(BIN)/ruff format --check
 	$(BIN)/ruff check
-	$(BIN)/mypy
+	$(BIN)/mypy --num-workers 2
 	PYTHONPATH=.:agents:transport:launch $(BIN)/lint-imports --no-cache
 
 # More workers than cores: many tests wait for the processes that they started.
@@ -71,13 +71,14 @@ $(READERS)/ready: tests/recordings/partners.txt
 	$(READERS)/bin/python -m pip install --quiet --disable-pip-version-check -r $<
 	@touch $@
 
-# What a new user does, with a browser; needs Chromium (Debian: apt-get install chromium).
+# What a new user does, with a browser; needs Chromium (Debian: apt-get install chromium). By file: one
+# has a team that all of its tests share, another one fixed ports.
 test-trial: setup
-	$(BIN)/pytest -m trial
+	$(BIN)/pytest -n 2 --dist loadfile -m trial
 
 # The core's tests with its hot files compiled, and that they say the same.
 test-compiled: compiled
-	$(BIN)/pytest -o pythonpath="$(COMPILED) agents transport launch tests" tests/core
+	$(BIN)/pytest -o pythonpath="$(COMPILED) agents transport launch tests" -n 2 tests/core
 	$(BIN)/pytest tests/benchmarks/test_compiled.py
 
 # Needs a Docker daemon: docker/dockerd.sh start. One at a time: containers share the machine.
@@ -86,7 +87,7 @@ test-docker: setup
 
 # Every fault scenario; those that need root or Docker say so where there is none.
 chaos: setup
-	$(BIN)/cpcbl-team chaos all --retries 1
+	$(BIN)/cpcbl-team chaos all --retries 1 --at-once 3
 
 # The net proves that a refactoring changes no bit; see tests/net/test_net.py.
 net: setup

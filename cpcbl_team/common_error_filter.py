@@ -86,6 +86,13 @@ def common_error_filter(
     return CommonErrorFilter(settings, field, camera)
 
 
+def common_errors_of(state: State) -> CommonErrors:
+    """What a robot that estimates errors beside its pose knows of them."""
+    common = state.memory.calibration.common
+    assert common is not None
+    return common
+
+
 class CommonErrorFilter:
     """Keeps what is known of the errors that one robot's sightings have in common together with
     its pose."""
@@ -107,16 +114,14 @@ class CommonErrorFilter:
 
     def before_motion(self, state: State, distance: float, turn: float, seconds: float) -> State:
         """The state before its pose moves by this (m, rad)."""
-        common = state.common_errors
-        assert common is not None
+        common = common_errors_of(state)
         if distance != 0.0 or turn != 0.0:
             common = common.after_motion(state.estimate.pose.heading, distance, turn)
         return with_common_errors(state, common.after_time(seconds))
 
     def with_object(self, state: State, name: str) -> State:
         """The state that estimates the place of this object, if it is uncertain on the map."""
-        common = state.common_errors
-        assert common is not None
+        common = common_errors_of(state)
         if name in common.objects or self._field.has_exact(name):
             return state
         covariance = place_covariance(self._field, name)
@@ -124,9 +129,7 @@ class CommonErrorFilter:
 
     def without_objects(self, state: State) -> State:
         """The state of a robot that was wrong about its pose, and so about all places it found."""
-        common = state.common_errors
-        assert common is not None
-        return with_common_errors(state, common.without_objects())
+        return with_common_errors(state, common_errors_of(state).without_objects())
 
     def has_no_place(self, state: State, name: str) -> bool:
         """Whether nobody has surveyed this landmark, and the robot does not know its place yet."""
@@ -134,16 +137,13 @@ class CommonErrorFilter:
 
     def has_found(self, state: State, name: str) -> bool:
         """Whether the robot estimates the place of this object with its pose."""
-        common = state.common_errors
-        assert common is not None
-        return name in common.objects
+        return name in common_errors_of(state).objects
 
     def with_reading(self, state: State, sighting: Sighting, now_ns: int) -> State:
         """The state after a sighting of a landmark whose place is not known yet: with its place, if
         that is determined now."""
-        common, name = state.common_errors, sighting.id
+        common, name = common_errors_of(state), sighting.id
         memory = state.memory.calibration
-        assert common is not None
         if state.lost or (name in memory.moved and memory.moved[name].is_unreliable):
             return state
         mark = self._field.unsurveyed[name]
@@ -177,15 +177,12 @@ class CommonErrorFilter:
 
     def corrected(self, state: State, sighting: Sighting) -> Sighting:
         """The sighting without the errors of the camera that are known."""
-        common = state.common_errors
-        assert common is not None
-        return common.corrected(sighting)
+        return common_errors_of(state).corrected(sighting)
 
     def as_evidence(self, state: State, m: Measurement) -> Measurement:
         """The measurement with sigmas that include the errors of the camera: for what has no place
         for them."""
-        common = state.common_errors
-        assert common is not None
+        common = common_errors_of(state)
         bearing = common.axis_rad if m.bearing is None else m.bearing
         of_range, of_bearing = common.reading_variances(bearing)
         return replace(
@@ -204,8 +201,7 @@ class CommonErrorFilter:
     def correct(self, state: State, accepted: Sequence[GatedObject]) -> tuple[State, Estimate]:
         """Steps 4 and 5: the state that knows the common errors better, and the estimate after the
         objects of the map and then, one by one, the teammates."""
-        prior, common = state.estimate, state.common_errors
-        assert common is not None
+        prior, common = state.estimate, common_errors_of(state)
         before = common.values
         readings = [
             Reading(c.row, sensitivity, c.residual, c.sigma * c.sigma)
@@ -250,8 +246,7 @@ class CommonErrorFilter:
         """The state and the estimate after a correction; without the place of a landmark that the
         robot has found and that no longer stands there. It is found anew."""
         memory, now_ns = state.memory.calibration, state.stamp_ns
-        assert memory.common is not None
-        prior = state.estimate, memory.common
+        prior = state.estimate, common_errors_of(state)
         sums = with_innovations(memory.innovations, *prior, accepted, now_ns)
         name = memory.rejections.misplaced(now_ns)
         is_rejected = common.objects.get(name) in common.found and accepts_others(state.updates)
@@ -278,8 +273,7 @@ class CommonErrorFilter:
     ) -> float:
         """The normalized innovation squared of a teammate's belief about a place that the robot has
         found: chi-square of two degrees of freedom. `covariance`: of the belief (m^2)."""
-        common = state.common_errors
-        assert common is not None
+        common = common_errors_of(state)
         x, y = common.place_error(belief.landmark)
         total = common.place_covariance(belief.landmark) + covariance
         return total.mahalanobis_squared(belief.x_m - x, belief.y_m - y)
@@ -289,8 +283,7 @@ class CommonErrorFilter:
     ) -> State:
         """The state after a teammate's belief about a place that the robot has found, by covariance
         intersection of all that it estimates; unchanged where that makes the pose no better."""
-        common, prior = state.common_errors, state.estimate
-        assert common is not None
+        common, prior = common_errors_of(state), state.estimate
         place = common.place_covariance(belief.landmark)
         if covariance.xx + covariance.yy >= place.xx + place.yy:
             return state
@@ -307,8 +300,7 @@ class CommonErrorFilter:
     ) -> tuple[State, Estimate]:
         """The state and the estimate after a teammate, or the position sensor, observed the pose
         of the prior."""
-        common = state.common_errors
-        assert common is not None
+        common = common_errors_of(state)
         unaffected = _UNAFFECTED[: len(observation.rows)]
         if by_teammate:
             prior, common = updated_by_teammate(

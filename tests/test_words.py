@@ -7,9 +7,10 @@ from pathlib import Path
 
 TOP = Path(__file__).parents[1]
 FOLDERS = ("cpcbl_team", "transport", "agents", "launch")
-PRIVATE = re.findall(
-    r"\w+",
-    """
+PRIVATE = set(
+    re.findall(
+        r"\w+",
+        """
     Said Voice Voices Verdict Standing judged heard seen beside against silenced forgiven surprise
     told Told hear Whereabouts by_fix by_sensor placed Place Glance glanced remembered noted
     told_evidence sought_ns moved drive reckoned turns resting offers measured doubted widened
@@ -24,6 +25,7 @@ PRIVATE = re.findall(
     determined unsettled lying spent healed thinned attached watched joined checked taken arrived
     stored connected filled clamped applied overlapping
     """,
+    )
 )
 
 

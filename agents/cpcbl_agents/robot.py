@@ -72,7 +72,8 @@ class Robot:
         self.start = RobotStart(start_ns, team.robots[name].start is not None, restarted)
         camera = settings.camera if settings.sensing == "camera" else None
         shared = frozenset(team.map.unsurveyed)
-        frames = robot_frames(name, team, start_ns)
+        order = FrameOrder(team.robots)
+        frames = robot_frames(name, team, start_ns, order)
         if begins_frame(team, name):
             settings = replace(settings, start=ORIGIN)
         known = settings, team.map_of(name), teammates, start_ns
@@ -84,7 +85,7 @@ class Robot:
         names = team.map.names | frozenset(team.robots)
         guests = GuestRegistry(names, team.guests.most if team.guests.allowed else 0)
         sharing = LandmarkSharing(name, shared, len(team.robots))
-        mates = TeammateFrames(name, teammates, FrameOrder(team.robots))
+        mates = TeammateFrames(name, teammates, order)
         mates.begin_frame(self.filter.frame)
         agent = name, settings, teammates, start_ns, budget, guests, sharing, mates
         self.collaboration = CollaborationAgent(*agent)
@@ -235,12 +236,11 @@ class Robot:
             yield Trust(*status[:5], late_s, status.contested)
 
 
-def robot_frames(name: str, team: Team, start_ns: int) -> RobotFrames | None:
+def robot_frames(name: str, team: Team, start_ns: int, order: FrameOrder) -> RobotFrames | None:
     """The frames of this robot; None in a team whose frame is that of the map."""
     if not team.map.is_frame_agreed:
         return None
     frame = frame_name(name, start_ns) if begins_frame(team, name) else FIELD
-    order = FrameOrder(team.robots)
     return RobotFrames(name, frame, order, team.map_of(name), knows_map(team, name))
 
 

@@ -2,7 +2,7 @@
 pictures without any: what its detector names, what it ranges, and how far that is off."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -51,21 +51,34 @@ def shaded_landmarks(
     kind: LightKind, frames: int, backgrounds: Sequence[Pixels], seed: int = 1
 ) -> LandmarkScore:
     """The detectors of both viewers on frames of one kind."""
-    team = eyes()
-    detectors = [CameraDetector(name, team) for name in VIEWERS]
-    random = np.random.default_rng([seed, LIGHTS.index(kind)])
+    return score_of(kind, shaded_frames(kind, frames, backgrounds, seed))
+
+
+def shaded_frames(
+    kind: LightKind, frames: int, backgrounds: Sequence[Pixels], seed: int
+) -> Iterator[tuple[str, Lit]]:
+    """Frames of one kind, for the viewers in turn, each with the name of its landmark."""
+    team, random = eyes(), np.random.default_rng([seed, LIGHTS.index(kind)])
     names, landmarks = sorted(team.map.landmarks), team.map.landmarks
-    score = LandmarkScore(kind, frames, 0, 0, [], [])
     for number in range(frames):
-        detector, name = detectors[number % 2], names[int(random.integers(len(names)))]
+        name = names[int(random.integers(len(names)))]
         upper, lower = (team.vision.colours[c] for c in landmarks[name].colours or ())
-        settings, shape = detector.camera.settings, team.vision.landmark
-        frame = landmark_frame(kind, (upper, lower), backgrounds, random, settings, shape)
-        found = detector.detections(frame.pixels)
+        settings, shape = team.robots[VIEWERS[number % 2]].camera, team.vision.landmark
+        yield name, landmark_frame(kind, (upper, lower), backgrounds, random, settings, shape)
+
+
+def score_of(kind: LightKind, frames: Iterable[tuple[str, Lit]]) -> LandmarkScore:
+    """What the detectors of the viewers find in these frames."""
+    detectors = [CameraDetector(name, eyes()) for name in VIEWERS]
+    score = LandmarkScore(kind, 0, 0, 0, [], [])
+    for number, (name, frame) in enumerate(frames):
+        found = detectors[number % 2].detections(frame.pixels)
         seen = found.sightings if isinstance(found, Detections) else ()
         own = [one for one in seen if one.id == name]
         score = score._replace(
-            named=score.named + len(own), wrong=score.wrong + len(seen) - len(own)
+            frames=number + 1,
+            named=score.named + len(own),
+            wrong=score.wrong + len(seen) - len(own),
         )
         for one in own:
             _note(score, one, frame)

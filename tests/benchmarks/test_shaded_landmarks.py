@@ -4,20 +4,27 @@ The bounds are below what `make bench-degraded ARGS='--landmarks 100'` measures 
 leave to chance.
 """
 
+from functools import cache
+
 import numpy as np
 import pytest
 from benchmarks.degraded_frames import textures
-from benchmarks.landmark_frames import LIGHTS, LightKind
-from benchmarks.shaded_landmarks import false_landmarks, printed, shaded_landmarks
+from benchmarks.landmark_frames import LIGHTS, LightKind, Lit
+from benchmarks.shaded_landmarks import false_landmarks, printed, score_of, shaded_frames
 
 from cpcbl_agents.vision import cylinders
 
 FRAMES = 16
 
 
+@cache
+def frames_of(light: LightKind) -> list[tuple[str, Lit]]:
+    return list(shaded_frames(light, FRAMES, textures(6, np.random.default_rng(3)), seed=4))
+
+
 @pytest.mark.parametrize("light", LIGHTS)
 def test_landmarks_in_any_light_are_ranged_and_none_is_wrong(light: LightKind) -> None:
-    score = shaded_landmarks(light, FRAMES, textures(6, np.random.default_rng(3)), seed=3)
+    score = score_of(light, frames_of(light))
     assert score.wrong == 0
     assert score.ranged >= (0.7 if light in {"low light", "warm lamp"} else 0.8)
     for errors in (score.ranges, score.bearings):
@@ -29,10 +36,9 @@ def test_landmarks_in_any_light_are_ranged_and_none_is_wrong(light: LightKind) -
 def test_edges_by_colour_alone_find_landmarks_that_a_shadow_line_crosses(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    pictures = textures(6, np.random.default_rng(3))
-    found = shaded_landmarks("vertical edge", FRAMES, pictures, seed=4)
+    found = score_of("vertical edge", frames_of("vertical edge"))
     monkeypatch.setattr(cylinders, "_is_wide", lambda pair: False)
-    without = shaded_landmarks("vertical edge", FRAMES, pictures, seed=4)
+    without = score_of("vertical edge", frames_of("vertical edge"))
     assert found.ranged > without.ranged
     assert found.wrong == without.wrong == 0
 

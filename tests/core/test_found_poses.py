@@ -136,7 +136,7 @@ LONG = [
 ]
 
 
-@over_seeds(4, 8)
+@over_seeds(2, 8)
 @pytest.mark.parametrize(
     ("gives", "count", "variant"),
     [

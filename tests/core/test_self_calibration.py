@@ -53,7 +53,6 @@ EXACT = OdometryNoise(
     turn_sigma_rad_per_sqrt_rad=1e-4,
     turn_sigma_rad_per_sqrt_m=1e-4,
 )
-LEARNS = LocalizerSettings(self_calibration=True)
 
 scales = st.floats(0.92, 1.08)
 biases = st.floats(math.radians(-3.0), math.radians(3.0))

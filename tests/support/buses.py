@@ -32,7 +32,6 @@ from cpcbl_transport.messages import Help, Message, Refusal, Status, decode_tagg
 MS = 1_000_000
 SECOND = 1000 * MS
 PATIENCE_S = 40.0  # machines may be busy; nothing waits longer than it has to
-HELP_KEYS = ("belief/", "fix/")
 MAP = Field(landmarks={"oak": Landmark(x_m=4.0, y_m=0.0), "elm": Landmark(x_m=0.0, y_m=4.0)})
 
 

@@ -91,6 +91,12 @@ Retries = Annotated[
     int,
     Option(min=0, help="Run a scenario that does not hold up to N times more; both are reported."),
 ]
+AtOnce = Annotated[
+    int,
+    Option(
+        min=1, help="Run up to N scenarios at the same time, but alone those that load the machine."
+    ),
+]
 
 
 def evaluate(
@@ -285,6 +291,7 @@ def chaos(
     require_judged: RequireJudged = False,
     markdown: MarkdownFile = None,
     retries: Retries = 0,
+    at_once: AtOnce = 1,
     report: options.ReportFile = None,
     as_json: options.AsJson = False,
 ) -> None:
@@ -306,8 +313,10 @@ def chaos(
     runner.require_judgeable(todo, duration)
     _prepare_for_faults()
     with runner.Progress(Console(stderr=True), len(todo)) as shown:
-        chosen = ScenarioOptions(seed, shown.on_step, duration, keys, history)
-        faults = runner.run_scenarios(todo, chosen, shown.on_begin, shown.on_end, retries=retries)
+        chosen = ScenarioOptions(seed, duration_s=duration, secured=keys, history=history)
+        faults = runner.run_scenarios(
+            todo, chosen, shown.on_begin, shown.on_end, retries=retries, at_once=at_once
+        )
     result = report_data(faults)
     lost = options.write_report(report, result)
     if (page := markdown) is not None:

@@ -113,10 +113,6 @@ class Weights(NamedTuple):
     readings: Floats
 
 
-def unweighted(problem: Problem) -> Weights:
-    return Weights(np.ones(len(problem.motions.pose)), np.ones(len(problem.readings.pose)))
-
-
 class Blocks(NamedTuple):
     """Residuals (k, r) of some measurements, and their derivatives (k, r, c) by the unknowns in
     `columns` (k, c)."""

@@ -108,9 +108,11 @@ def test_a_recorded_team_is_written_as_it_was(recorded: Path) -> None:
     assert msgspec.convert(non_default_settings(team), Team) == TEAM
 
 
-def test_calibrate_prints_writes_and_draws(recorded: Path, tmp_path: Path) -> None:
+def test_calibrate_prints_writes_and_draws(tmp_path: Path) -> None:
     type_text, picture = tmp_path / "calibrated.toml", tmp_path / "residuals.png"
-    ran = cpcbl_team("calibrate", recorded, "--output", type_text, "--picture", picture)
+    path = tmp_path / "trio.mcap"
+    simulate_recorded(TEAM, 1, 30.0, path)
+    ran = cpcbl_team("calibrate", path, "--output", type_text, "--picture", picture)
     assert ran.returncode == 0, ran.stderr
     assert max(len(line) for line in ran.stdout.splitlines()[:-1]) <= 80  # last: a path
     for word in ("loss m/rad", "bias deg", "±", "does not drive", str(type_text.name)):

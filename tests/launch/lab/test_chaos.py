@@ -9,7 +9,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, nullcontext
 from io import StringIO
 from pathlib import Path
@@ -91,6 +91,10 @@ def scenario_of(name: str, *checks: Check, needs: Requirement = NOTHING) -> Scen
     )
 
 
+def begin(_: Scenario) -> Callable[[str], None]:
+    return lambda step: None
+
+
 def test_every_scenario_has_a_unique_name_and_an_expectation() -> None:
     names = [s.name for s in SCENARIOS]
     assert len(set(names)) == len(names)
@@ -131,13 +135,43 @@ def test_a_failure_and_a_missing_requirement_are_distinguished() -> None:
     ]
     began: list[str] = []
     done: list[Outcome] = []
-    calls = lambda s: began.append(s.name), done.append
-    faults = run_scenarios(table, ScenarioOptions(), *calls, nullcontext)
+
+    def on_begin(scenario: Scenario) -> Callable[[str], None]:
+        began.append(scenario.name)
+        return begin(scenario)
+
+    faults = run_scenarios(table, ScenarioOptions(), on_begin, done.append, nullcontext)
     assert [o.is_met for o in faults.outcomes] == [True, False, False, None]
     assert faults.outcomes[2].failed == "the team did not settle"
     assert faults.outcomes[3].not_run == "needs root"
     assert began == [o.scenario for o in done] == ["good", "bad", "broken", "rooted"]
     assert not faults.is_met
+
+
+def test_scenarios_run_side_by_side_unless_they_load_the_machine() -> None:
+    two, done, done_before = threading.Barrier(2), list[str](), dict[str, list[str]]()
+    check = Check(what="n", seen=1, at_least=1)
+
+    def scenario(name: str, alone: bool, longest_s: float) -> Scenario:
+        def runs(_: ScenarioOptions) -> ScenarioResult:
+            done_before[name] = list(done)
+            if not alone:
+                two.wait(60.0)  # for another one that runs at the same time
+            return ScenarioResult([check])
+
+        return scenario_of(name)._replace(run=runs, alone=alone, longest_s=longest_s)
+
+    table = [scenario("loads", True, 9.0), scenario("short", False, 1.0)]
+    table += [scenario(name, False, s) for name, s in {"a": 8.0, "b": 7.0, "c": 6.0}.items()]
+
+    def on_end(outcome: Outcome) -> None:
+        done.append(outcome.scenario)
+
+    faults = run_scenarios(table, ScenarioOptions(), begin, on_end, nullcontext, at_once=2)
+    assert faults.is_met
+    assert [o.scenario for o in faults.outcomes] == ["loads", "short", "a", "b", "c"]
+    assert done_before["a"] == done_before["b"] == []  # the longest are first
+    assert len(done_before["loads"]) == 4
 
 
 @pytest.mark.parametrize(("retries", "held"), [(0, False), (1, False), (2, True), (5, True)])
@@ -148,8 +182,8 @@ def test_a_scenario_that_does_not_hold_is_tried_again(retries: int, held: bool) 
         return ScenarioResult([Check(what="m", seen=next(seen), at_least=1)], ("warm",))
 
     table, done = [scenario_of("shaky")._replace(run=holds_at_last)], list[Outcome]()
-    calls = lambda _: None, done.append
-    faults = run_scenarios(table, ScenarioOptions(), *calls, nullcontext, retries=retries)
+    options = ScenarioOptions()
+    faults = run_scenarios(table, options, begin, done.append, nullcontext, retries=retries)
     (outcome,) = faults.outcomes
     assert (outcome.is_met, done) == (held, [outcome])
     before = ("attempt 1 did not hold: m 0 (≥ 1)", "attempt 2 did not hold: m 0.5 (≥ 1)")
@@ -182,12 +216,13 @@ def test_the_command_reports_a_scenario_as_table_json_and_markdown(tmp_path: Pat
     assert "1/1 kill-robot" in ran.stderr
 
 
-def test_a_scenario_that_is_interrupted_leaves_no_process() -> None:
-    command = [*PROGRAM, "chaos", "kill-robot"]
+@pytest.mark.parametrize("at_once", [1, 2])
+def test_scenarios_that_are_interrupted_leave_no_process(at_once: int) -> None:
+    command = [*PROGRAM, "chaos", "kill-robot", "kill-observer", "--at-once", str(at_once)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
         children = ["robot", "navigator", "--parent", str(process.pid)]
         try:
-            assert eventually(lambda: bool(pids_of(children)))
+            assert eventually(lambda: len(pids_of(children)) == at_once)
         finally:
             process.terminate()
             process.communicate(timeout=30.0)

@@ -66,8 +66,8 @@ def distrust_without_liars(
 
 @pytest.mark.timeout(300)
 def test_no_correct_robot_is_quarantined_in_two_runs() -> None:
-    assert distrust_without_liars("three observers", [1], 40.0) == []
-    assert distrust_without_liars("biased sensors", [2], 40.0) == []
+    assert distrust_without_liars("three observers", [1], 25.0) == []
+    assert distrust_without_liars("biased sensors", [2], 25.0) == []
 
 
 @pytest.mark.long

@@ -17,13 +17,13 @@ QUICK = (
     ("the same, seen in turn", "surveyed", "both"),
     ("name nowhere", "surveyed", "both"),
     ("mirrored", "surveyed", "both"),
-    ("in centimetres", "surveyed", "both"),
     ("in feet", "surveyed", "both"),
 )
+LONG = ("in centimetres", "surveyed", "both")
 
 
 @over_seeds(1, 5)
-@pytest.mark.parametrize("key", QUICK, ids=", ".join)
+@pytest.mark.parametrize("key", [*QUICK, pytest.param(LONG, marks=pytest.mark.long)], ids=", ".join)
 def test_what_is_wrong_with_a_map_is_named_and_misleads_nobody(
     key: tuple[str, str, str], seeds: range
 ) -> None:

@@ -15,10 +15,10 @@ from cpcbl_launch.mapping.normal_equations import NormalEquations, elimination_o
 from cpcbl_launch.mapping.problem import (
     CONSTANTS,
     Problem,
+    Weights,
     linearize,
     motion_blocks,
     reading_blocks,
-    unweighted,
 )
 from cpcbl_launch.mapping.solve import robust_weights
 from cpcbl_launch.reporting.metrics import Floats
@@ -54,7 +54,8 @@ def test_derivatives_are_those_of_finite_differences(blocks) -> None:  # type: i
 
 def test_elimination_solves_the_normal_equations() -> None:
     problem, x = small_problem()
-    linear = linearize(problem, x, unweighted(problem))
+    weights = Weights(np.ones(len(problem.motions.pose)), np.ones(len(problem.readings.pose)))
+    linear = linearize(problem, x, weights)
     dense = (linear.jacobian.T @ linear.jacobian).toarray()
     equations = NormalEquations(linear, elimination_order(problem), 0.0)
     right = np.random.default_rng(1).standard_normal((problem.size, 3))

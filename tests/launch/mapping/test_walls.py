@@ -17,7 +17,6 @@ from cpcbl_team.inputs import Sighting
 
 EXACT = 1e-5
 PARALLEL = {name: ROOM[name] for name in ("south", "north")}
-BESIDE_1 = 0.07  # 95 % of the mean of a degree of freedom over 50 seeds: 50 x 16 of them and more
 
 
 def without_range(robot: str, at_s: float, s: Sighting) -> Sighting:

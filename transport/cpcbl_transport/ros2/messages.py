@@ -41,7 +41,6 @@ MESSAGE_TYPES = (
 
 LARGEST_BYTES = 1_000_000
 LARGEST_IMAGE_BYTES = 64_000_000
-LITTLE_ENDIAN_CDR = b"\x00\x01\x00\x00"
 
 Message = Any
 """A dataclass of rosbags."""

@@ -1,11 +1,13 @@
-"""Runs scenarios one after another, so that they do not disturb each other; shows the outcomes."""
+"""Runs scenarios so that they do not disturb each other; shows the outcomes."""
 
 import os
 import platform
 import subprocess
+import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager
 from importlib.metadata import version
 from typing import Self
@@ -88,27 +90,45 @@ def _run_until_held(scenario: Scenario, options: ScenarioOptions, retries: int) 
 
 
 def run_scenarios(
-    scenarios: Iterable[Scenario],
+    scenarios: Sequence[Scenario],
     options: ScenarioOptions,
-    on_begin: Callable[[Scenario], None],
+    on_begin: Callable[[Scenario], Callable[[str], None]],
     on_end: Callable[[Outcome], None],
     watching: Callable[[], AbstractContextManager[MachineWatch | None]] = MachineWatch,
     retries: int = 0,
+    at_once: int = 1,
 ) -> ChaosReport:
-    """Runs scenarios; calls `on_begin` and `on_end` for each. `watching` the machine meanwhile.
-    A scenario that does not hold is run up to `retries` times more: its last outcome counts, and
-    what did not hold before is among its remarks."""
-    outcomes = []
-    with watching() as watch:
+    """Runs scenarios, and watches the machine meanwhile (`watching`).
+
+    `on_begin` returns what is called with each step of the scenario, `on_end` gets its outcome. A
+    scenario that does not hold is run up to `retries` times more: its last outcome counts, and
+    what did not hold before is among its remarks. Up to `at_once` scenarios run at the same time,
+    the longest first; those that load the machine run afterwards, alone.
+    """
+    stopped = threading.Event()
+    together = [s for s in scenarios if at_once > 1 and not s.alone]
+    longest_first = sorted(together, key=lambda s: -s.longest_s)
+    with watching() as watch, ThreadPoolExecutor(at_once) as pool:
+        watched = options._replace(machine=watch, is_stopped=stopped.is_set)
+
+        def run(scenario: Scenario) -> Outcome:
+            own = watched._replace(report_progress=on_begin(scenario))
+            outcome = _run_until_held(scenario, own, retries)
+            on_end(outcome)
+            return outcome
+
+        try:
+            outcomes = {outcome.scenario: outcome for outcome in pool.map(run, longest_first)}
+        except BaseException:
+            stopped.set()  # for the threads, which the pool waits for
+            raise
         for scenario in scenarios:
-            on_begin(scenario)
-            watched = options._replace(machine=watch)
-            outcomes.append(_run_until_held(scenario, watched, retries))
-            on_end(outcomes[-1])
+            if scenario.name not in outcomes:
+                outcomes[scenario.name] = run(scenario)
     cores, load = os.cpu_count() or 1, os.getloadavg()[0]
     machine = f"{platform.system()} {platform.machine()}, {cores} cores, load {load:.1f}"
-    own = version("cpcbl-team")
-    return ChaosReport(version=own, seed=options.seed, machine=machine, outcomes=tuple(outcomes))
+    own, ordered = version("cpcbl-team"), tuple(outcomes[s.name] for s in scenarios)
+    return ChaosReport(version=own, seed=options.seed, machine=machine, outcomes=ordered)
 
 
 # For people ---------------------------------------------------------------------------------------
@@ -169,25 +189,33 @@ def markdown(faults: ChaosReport) -> Iterator[str]:
 
 
 class Progress(Status):
-    """Shows the progress: a line for the current step on a terminal, and a line for each scenario
+    """Shows the progress: a line for the current steps on a terminal, and a line for each scenario
     that is done. A context manager."""
 
     def __init__(self, console: Console, total: int) -> None:
         super().__init__("", console=console)
-        self._step, self._total, self._count = "", total, 0
+        self._total, self._count, self._lock = total, 0, threading.Lock()
+        self._steps: dict[str, tuple[str, str]] = {}  # label and step of those that run, by name
 
     def __enter__(self) -> Self:
         self.start()
         return self
 
-    def on_begin(self, scenario: Scenario) -> None:
-        self._count += 1
-        self._step = f"{self._count}/{self._total} {scenario.name}"
-        self.on_step("starting")
+    def on_begin(self, scenario: Scenario) -> Callable[[str], None]:
+        with self._lock:
+            self._count += 1
+            label = f"{self._count}/{self._total} {scenario.name}"
 
-    def on_step(self, what: str) -> None:
-        self.update(Text(f"{self._step}: {what}"))
+        def on_step(what: str) -> None:
+            with self._lock:
+                self._steps[scenario.name] = label, what
+                self.update(Text("; ".join(map(": ".join, self._steps.values()))))
+
+        on_step("starting")
+        return on_step
 
     def on_end(self, outcome: Outcome) -> None:
-        line = Text(f"{self._step}, {outcome.seconds:.0f} s: ")
+        with self._lock:
+            label, _ = self._steps.pop(outcome.scenario)
+        line = Text(f"{label}, {outcome.seconds:.0f} s: ")
         self.console.print(line.append_text(verdict(outcome)))

@@ -26,6 +26,7 @@ class ScenarioOptions(NamedTuple):
     history: Path | None = None  # where the nemesis writes what happened
     fault: str = ""  # the step of the fault: what the scenario does
     machine: MachineWatch | None = None  # None: nobody watches it
+    is_stopped: Callable[[], bool] = lambda: False  # whether to end as soon as possible
 
 
 class ScenarioResult(NamedTuple):
@@ -47,6 +48,8 @@ class Scenario(NamedTuple):
     run: Callable[[ScenarioOptions], ScenarioResult]
     needs: Requirement = Requirement()
     quick: bool = False  # whether the ordinary test suite runs it, too
+    alone: bool = True  # whether it loads the machine, so that no other one may run meanwhile
+    longest_s: float = 0.0  # how long it lasts at most after the team has settled
 
 
 # A fault of a team --------------------------------------------------------------------------------
@@ -100,6 +103,12 @@ class TeamFault(msgspec.Struct, frozen=True):
     after_s: float = 8.0
     remark: Callable[[TeamUnderTest, FaultRun], str] | None = None  # adds figures without bounds
 
+    @property
+    def longest_s(self) -> float:
+        """How long it lasts at most after the team has settled."""
+        healed_s = self.simulated_s[1] if self.simulated_s else self.baseline_s + self.lasts_s
+        return healed_s + self.after_s
+
     def __call__(self, options: ScenarioOptions) -> ScenarioResult:
         """Runs the team, injects the fault, and checks what happened."""
         options.report_progress("starting a team")
@@ -107,7 +116,7 @@ class TeamFault(msgspec.Struct, frozen=True):
         plan = plan._replace(secured=plan.secured or options.secured)
         if plan.secured and plan.lossy:
             raise MissingError("with keys: the router's certificate does not name this link")
-        with run_team(plan, options.machine) as team:
+        with run_team(plan, options.machine, options.is_stopped) as team:
             team.settle(self.settled_m)
             team.run_for(0.0 if self.simulated_s else self.baseline_s)
             run = FaultRun(team.run_log, team.robots, self.robot, team.now_s, far=team.plan.far)

@@ -90,10 +90,13 @@ def _scenarios() -> Iterator[Scenario]:
     text = (files("cpcbl_launch.lab.chaos") / "scenarios.toml").read_bytes()
     rows = msgspec.toml.decode(text, type=dict[str, _Row])
     for name, row in rows.items():
-        if (run := OWN_SHAPE.get(name)) is None:
-            run = team_fault(**_settings(rows, row))
-        needs = REQUIREMENTS[row.needs]
-        yield Scenario(name, row.fault, row.expectation, run, needs, row.quick)
+        told, needs = (name, row.fault, row.expectation), REQUIREMENTS[row.needs]
+        if (own := OWN_SHAPE.get(name)) is not None:
+            yield Scenario(*told, own, needs, row.quick)
+        else:
+            settings = _settings(rows, row)
+            run, alone = team_fault(**settings), "abuse" in settings
+            yield Scenario(*told, run, needs, row.quick, alone, run.longest_s)
 
 
 SCENARIOS = tuple(_scenarios())

@@ -74,10 +74,15 @@ class TeamUnderTest:
     """Made by `run_team`. Times are seconds of robot time after the run's epoch."""
 
     def __init__(
-        self, plan: RunPlan, folder: Path, stack: ExitStack, machine: MachineWatch | None = None
+        self,
+        plan: RunPlan,
+        folder: Path,
+        stack: ExitStack,
+        machine: MachineWatch | None,
+        is_stopped: Callable[[], bool],
     ) -> None:
         """Starts all processes; `stack` ends them."""
-        self._machine = machine
+        self._machine, self._is_stopped = machine, is_stopped
         plan = secured_plan(plan, folder / "keys") if plan.secured else plan
         team, protocol = plan.team, "tls" if plan.secured else "tcp"
         self.plan, self.folder, self.team_file = plan, folder, folder / "team.json"
@@ -201,11 +206,14 @@ class TeamUnderTest:
         self.wait_until(lambda: False, seconds)
 
     def wait_until(self, condition: Callable[[], bool], within_s: float = PATIENCE_S) -> bool:
-        """Waits for a condition, and restarts what dies meanwhile; whether it was met in time."""
+        """Waits for a condition, and restarts what dies meanwhile; whether it was met in time.
+        Raises KeyboardInterrupt as soon as the run is stopped."""
         end_s = time.monotonic() + within_s
         while not condition():
             if time.monotonic() >= end_s:
                 return False
+            if self._is_stopped():
+                raise KeyboardInterrupt
             self.watch()
             time.sleep(POLL_S)
         return True
@@ -239,11 +247,15 @@ class TeamUnderTest:
 
 
 @contextmanager
-def run_team(plan: RunPlan, machine: MachineWatch | None = None) -> Iterator[TeamUnderTest]:
+def run_team(
+    plan: RunPlan,
+    machine: MachineWatch | None = None,
+    is_stopped: Callable[[], bool] = lambda: False,
+) -> Iterator[TeamUnderTest]:
     """A team with all its processes. Raises ChaosError if one of them has not ended afterwards."""
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="cpcbl-chaos-")))
-        team = TeamUnderTest(plan, folder, stack, machine)
+        team = TeamUnderTest(plan, folder, stack, machine, is_stopped)
         yield team
     left = []
     for pid in team.seen_pids:

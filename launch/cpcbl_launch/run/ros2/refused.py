@@ -44,7 +44,6 @@ class BadMessage(StrEnum):
     WRONG_ENCODING = "wrong_encoding"
     UNSUPPORTED = "unsupported"
     UNREADABLE = "unreadable"
-    NO_ROBOT = "no_robot"
 
 
 class Refused(NamedTuple):
