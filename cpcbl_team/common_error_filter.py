@@ -194,9 +194,7 @@ class CommonErrorFilter:
     def place_covariance(self, state: State, m: Measurement) -> Covariance2:
         """The covariance (m^2) of the place of an object that is estimated with the pose; zero of
         any other one."""
-        common = state.common_errors
-        assert common is not None
-        return common.place_covariance(m.source) if m.is_estimated else EXACT
+        return common_errors_of(state).place_covariance(m.source) if m.is_estimated else EXACT
 
     def correct(self, state: State, accepted: Sequence[GatedObject]) -> tuple[State, Estimate]:
         """Steps 4 and 5: the state that knows the common errors better, and the estimate after the
