@@ -68,6 +68,15 @@ class MeanOffset(NamedTuple):
         """Whether it is certain enough for a vote."""
         return self.is_within(MOST_SIGMA_M)
 
+    @property
+    def can_be_wrong(self) -> bool:
+        """Whether it is certain enough along any axis for others to contradict it: the smaller
+        eigenvalue of its covariance. One that is vague along the other axis has no vote, for it
+        would agree with anybody there, but as much weight along this one."""
+        xx, xy, yy = self.covariance
+        least = 0.5 * (xx + yy) - math.hypot(0.5 * (xx - yy), xy)
+        return least <= MOST_SIGMA_M * MOST_SIGMA_M
+
 
 def about_position(evidence: Sums, heading_variance: float) -> tuple[Covariance2, Offset]:
     """What evidence of the offset of the estimate says of its position: matrix and vector. The
@@ -119,6 +128,14 @@ def with_position_error(evidence: Sums, covariance: Covariance2) -> Sums:
     return matrix, (rxx * x + rxy * y, ryx * x + ryy * y, h - gx * x - gy * y)
 
 
+def product(a: Covariance2, d: Covariance2) -> Covariance2:
+    """A D A of two symmetric matrices."""
+    (xx, xy, yy), (dxx, dxy, dyy) = a, d
+    px, py = xx * dxx + xy * dxy, xx * dxy + xy * dyy  # rows of A D
+    qx, qy = xy * dxx + yy * dxy, xy * dxy + yy * dyy
+    return Covariance2(px * xx + py * xy, px * xy + py * yy, qx * xy + qy * yy)
+
+
 class FadingOffsets(NamedTuple):
     """Fading sums over the reports of one source."""
 
@@ -126,29 +143,31 @@ class FadingOffsets(NamedTuple):
     reports: float = 0.0
     squares: float = 0.0  # of the weights of the reports
     evidence: Sums = (ZERO3, (0.0, 0.0, 0.0))
-    """About the offset (m, m, rad) of the estimate, by the independent part of the noise."""
+    """About the offset (m, m, rad) of the estimate, by the whole noise of each report."""
     dependent: Covariance2 = NOTHING
-    """The mean of the parts of the noise that are the same in all reports, m^2."""
+    """The sum of A D A, 1/m^2: the information A of each report about the position, and the part D
+    of its noise that all reports of the source have in common."""
 
     def with_report(
         self, stamp_ns: int, fading_ns: int, evidence: Sums, dependent: Covariance2 = NOTHING
     ) -> "FadingOffsets":
-        """The sums with one more report. A report that is older than the last fades nothing."""
+        """The sums with one more report. A report that is older than the last fades nothing.
+        `evidence`: by the independent part of its noise; `dependent` (m^2): the other part. A
+        source has weight along the axes along which it is certain, and only there."""
         elapsed_ns = stamp_ns - self.stamp_ns
         fade = math.exp(-elapsed_ns / fading_ns) if elapsed_ns > 0 else 1.0
+        if dependent is not NOTHING:
+            evidence = with_position_error(evidence, dependent)
         (matrix, vector), (more, further) = self.evidence, evidence
-        count = fade * self.reports + 1.0
-        share = 1.0 / count
-        (xx, xy, yy), (dxx, dxy, dyy) = self.dependent, dependent
         fields = (
             max(stamp_ns, self.stamp_ns),
-            count,
+            fade * self.reports + 1.0,
             fade * fade * self.squares + 1.0,
             (
                 Covariance3(*(fade * a + b for a, b in zip(matrix, more, strict=True))),
                 tuple(fade * a + b for a, b in zip(vector, further, strict=True)),
             ),
-            Covariance2(xx + share * (dxx - xx), xy + share * (dxy - xy), yy + share * (dyy - yy)),
+            self.dependent.scaled(fade) + product(Covariance2(*more[:3]), dependent),
         )
         return new(FadingOffsets, fields)
 
@@ -166,10 +185,12 @@ class FadingOffsets(NamedTuple):
         determinant = xx * yy - xy * xy
         if determinant <= 1e-9 * xx * yy or xx <= 0.0 or yy <= 0.0:
             return None
-        cxx, cxy, cyy = yy / determinant, -xy / determinant, xx / determinant
-        # The variance of a weighted mean: old reports fade, so their errors do too.
-        covariance = Covariance2(cxx, cxy, cyy).scaled(self.squares / self.reports)
-        covariance += self.dependent
+        inverse = cxx, cxy, cyy = yy / determinant, -xy / determinant, xx / determinant
+        # The variance of a weighted mean: old reports fade, so their errors do too. The dependent
+        # parts are correlated in any way: covariance intersection, with the weights of the reports.
+        once = self.squares / self.reports
+        common = product(Covariance2(*inverse), self.dependent).scaled(self.reports - once)
+        covariance = Covariance2(*inverse).scaled(once) + common
         offset = cxx * x + cxy * y, cxy * x + cyy * y
         return MeanOffset(*offset, covariance, common_m, self.stamp_ns, estimate_variance)
 
@@ -214,12 +235,16 @@ def contradicts(one: MeanOffset, other: MeanOffset) -> bool:
 
 def bias_variance(one: MeanOffset, other: MeanOffset) -> float:
     """The square of the bias (m^2) by which the noise of two means does not explain their
-    difference."""
+    difference d, along the direction w = C^-1 d in which they disagree most: (d w)^2 / w^2, less
+    the part 2 / chi-square of it that two degrees of freedom have on average. With the same noise
+    C along both axes this is d^2 less the trace of C."""
     if disagreement(one, other) <= USUAL:
         return 0.0
-    dx, dy = one.x - other.x, one.y - other.y
-    c, d = one.covariance, other.covariance
-    excess = dx * dx + dy * dy - (c.xx + c.yy + d.xx + d.yy + 2.0 * _growth(one, other))
+    dx, dy, growth = one.x - other.x, one.y - other.y, _growth(one, other)
+    (xx, xy, yy) = one.covariance + other.covariance + Covariance2(growth, 0.0, growth)
+    wx, wy = yy * dx - xy * dy, xx * dy - xy * dx  # times the determinant
+    determinant, along = xx * yy - xy * xy, wx * dx + wy * dy
+    excess = along * (along - 2.0 * determinant) / (wx * wx + wy * wy)
     return excess if excess > 0.0 else 0.0
 
 

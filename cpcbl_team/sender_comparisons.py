@@ -104,7 +104,7 @@ def contest_m(senders: SenderRecords, name: str) -> float:
 
 
 def compare(senders: SenderRecords, name: str, now_ns: int) -> Comparison | None:
-    """The result of test 3; None while the sender has no recent mean that is precise. A majority
+    """The result of test 3; None while the sender has no recent mean that can be wrong. A majority
     decides a contest by both means: in one, the estimate may move fast, and means of a long time
     differ by that where one sender reported more of late than another."""
     fast, slow = (_comparison_of(senders, name, now_ns, of) for of in (FAST, SLOW))
@@ -129,7 +129,7 @@ def _sees(senders: SenderRecords, now_ns: int) -> bool:
 def _comparison_of(senders: SenderRecords, name: str, now_ns: int, of: int) -> Comparison | None:
     """The result of test 3 with one mean of a sender (`of`: FAST or SLOW)."""
     record, mean = senders[name], senders[name].means[of]
-    if record.offsets[of].stamp_ns != now_ns or mean is None or not mean.is_precise:
+    if record.offsets[of].stamp_ns != now_ns or mean is None or not mean.can_be_wrong:
         return None
     return _result(mean, voting_means(senders, now_ns, name, of))
 

@@ -41,6 +41,9 @@ LAST_OFFSET_SHARE = 0.2  # with which the last offset counts in their mean and v
 LEAST_DISTANCE_M = 0.3  # the shortest distance that shows whether a sender follows the robot
 LONGEST_COMPARISON_NS = 5_000_000_000  # after this time without a jump any distance is a comparison
 FADING_S = 10.0  # time constant with which conflicts with odometry fade
+CLEAR_CONFLICTS = 0.5  # so many conflicts speak against a sender if one was just before a dispute,
+REPEATED_CONFLICTS = 1.5  # and so many at any time: an old one alone may be chance
+JUST_BEFORE_NS: Final = 2_000_000_000
 NEVER_NS: Final = -(2**62)
 
 
@@ -253,6 +256,12 @@ def _with_position(record: SenderRecord, now: ReportedPosition | None) -> Sender
     # While the robot stands, a frozen sender is right: that confirms nothing.
     confirms = is_far or record.reason is not QuarantineReason.FROZEN
     return replace(record, confirmations=record.confirmations + 1) if confirms else record
+
+
+def is_in_conflict(record: SenderRecord, began_ns: int) -> bool:
+    """Whether odometry speaks against a sender in a dispute that began then."""
+    is_old = record.last_conflict_ns < began_ns - JUST_BEFORE_NS
+    return record.odometry_conflicts >= (REPEATED_CONFLICTS if is_old else CLEAR_CONFLICTS)
 
 
 def distances_between(then: ReportedPosition, now: ReportedPosition) -> tuple[float, float, float]:

@@ -177,7 +177,7 @@ class TeammateScreen:
         return self._teammates is not None and sender not in self._teammates
 
     def _evidence(self, state: State, observation: Observation) -> OffsetEvidence:
-        """What a report says of the offset of the estimate."""
+        """What a sighting of a teammate says of the offset of the estimate."""
         dependent = observation.dependent
         sums = observation.information(observation.noise(0.0))
         variance = 0.5 * (dependent.xx + dependent.yy)
@@ -214,7 +214,7 @@ class TeammateScreen:
             None if is_lost else nis,
             (ex, ey),
             ReportedPosition(*where),
-            self._evidence(state, position),
+            _evidence_at(state, position.information(position.noise(0.0)), position.dependent),
             self._is_guest(observation.sender),
             of_heading,
         )

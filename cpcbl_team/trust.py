@@ -47,6 +47,7 @@ from cpcbl_team.sender_records import (
     SenderRecord,
     TeammateReport,
     distances_between,
+    is_in_conflict,
     quarantined,
     reason_of,
     released,
@@ -57,7 +58,6 @@ from cpcbl_team.sender_records import (
 
 FRESH_BELIEF_NS: Final = 300_000_000  # the robot of an older belief may have turned since
 TIE_NS = 1_500_000_000  # a dispute between equally many is decided for the estimate after this time
-CLEAR_CONFLICTS = 0.5  # odometry speaks against a sender with this many conflicts
 MOST_CONFLICTS = 2.5  # with more a sender is quarantined: at the third within a short time
 LEAST_AGREEMENTS = 10  # reports that must agree with the estimate before a sender is readmitted,
 LEAST_CONFIRMATIONS = 2  # or distances that must agree with odometry
@@ -197,7 +197,7 @@ def _decide_dispute(
     contest = {r.name for n in dissenters for r in open_rivals(senders, n)}
     if OWN_SENSORS not in dissenters | supporters and contest & supporters:
         return TrustDecision(senders, True)
-    is_right = _is_estimate_right(recent, dissenters, supporters, now_ns - began_ns)
+    is_right = _is_estimate_right(recent, dissenters, supporters, began_ns, now_ns)
     if is_right is None:
         return TrustDecision(senders, False)
     if not is_right:
@@ -208,7 +208,7 @@ def _decide_dispute(
 
 
 def _is_estimate_right(
-    recent: SenderRecords, dissenters: set[str], supporters: set[str], dispute_ns: int
+    recent: SenderRecords, dissenters: set[str], supporters: set[str], began_ns: int, now_ns: int
 ) -> bool | None:
     """Whether the estimate and its supporters are right; None while that is undecided. The robot's
     own sensors decide, otherwise odometry, otherwise the majority, and after some time the estimate
@@ -216,12 +216,12 @@ def _is_estimate_right(
     if OWN_SENSORS in supporters or OWN_SENSORS in dissenters:
         return OWN_SENSORS in supporters
     all_sides = dissenters | supporters
-    conflicting = {n for n in all_sides if recent[n].odometry_conflicts >= CLEAR_CONFLICTS}
+    conflicting = {n for n in all_sides if is_in_conflict(recent[n], began_ns)}
     if not all_sides <= conflicting:
         dissenters, supporters = dissenters - conflicting, supporters - conflicting
     if len(supporters) != len(dissenters):
         return len(supporters) > len(dissenters)
-    return True if dispute_ns >= TIE_NS else None
+    return True if now_ns - began_ns >= TIE_NS else None
 
 
 def _is_odometry_wrong(senders: SenderRecords, name: str, rules: TrustSettings) -> bool:

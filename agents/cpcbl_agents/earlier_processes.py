@@ -62,10 +62,16 @@ def wait_until_alone(
 class OwnTokens:
     """The tokens of one process."""
 
-    def __init__(self, bus: Bus, robot: str, incarnation: str) -> None:
+    def __init__(
+        self, bus: Bus, robot: str, incarnation: str, before: EarlierRuns = NEVER_RAN
+    ) -> None:
+        """`before`: what the robot did in earlier processes. A router that is started again learns
+        it from this one."""
         self._bus, self._names = bus, {"robot": robot, "incarnation": incarnation}
         self._has_moved = False
         bus.declare_token(topics.RAN.at(**self._names, how=STILL))
+        if before.moved:
+            self.declare_moved()
 
     def declare_moved(self) -> None:
         """The robot is no longer where it started. May be called again and again."""

@@ -126,15 +126,11 @@ def run_robot(
         open_bus(team.name, link.endpoints, stop, link.credentials) as bus,
     ):
         before = wait_until_alone(bus.tokens, name, stop)
-        robot = make_robot(
-            name,
-            team,
-            clock,
-            before if restarted is None else EarlierRuns(restarted, before.ran or restarted),
-            camera,
-        )
+        if restarted is not None:
+            before = EarlierRuns(restarted, before.ran or restarted)
+        robot = make_robot(name, team, clock, before, camera)
         start = NodeStart(clock.now_ns(), new_incarnation(), clock.speed)
-        logger, tokens = RobotLogger(name), OwnTokens(bus, name, start.incarnation)
+        logger, tokens = RobotLogger(name), OwnTokens(bus, name, start.incarnation, before)
 
         def on_status(status: Status) -> None:
             logger.log_status(status)

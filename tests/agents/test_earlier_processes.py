@@ -48,6 +48,42 @@ def test_a_router_remembers_who_has_moved() -> None:
         check(*(stack.enter_context(open_bus("lab", [endpoint])) for _ in range(3)))
 
 
+def test_a_router_that_is_started_again_learns_it_from_a_later_process_that_stands() -> None:
+    """The second process of a robot knew that it had moved, and told nobody: killed beside the
+    next router, its third one was certain of a start that the robot had left long ago."""
+    with ExitStack() as stack:
+        endpoint = free_endpoint()
+        router = open_router("lab", [endpoint])
+        repeat_tokens(router)
+        first = stack.enter_context(open_bus("lab", [endpoint]))
+        OwnTokens(first, "r1", "1").declare_moved()
+        second = stack.enter_context(open_bus("lab", [endpoint]))
+        wait_until(lambda: len(second.tokens(topics.RAN.at(robot="r1"))) == 4)
+        first.close()
+        OwnTokens(second, "r1", "2", wait_until_alone(second.tokens, "r1"))
+        router.close()
+        repeat_tokens(stack.enter_context(open_router("lab", [endpoint])))
+        third = stack.enter_context(open_bus("lab", [endpoint]))
+        wait_until(lambda: len(third.tokens(topics.RAN.at(robot="r1"))) == 4)
+        second.close()
+        assert wait_until_alone(third.tokens, "r1") == EarlierRuns(moved=True, ran=True)
+
+
+def test_a_router_that_is_started_again_does_not_know_who_was_killed_before_it() -> None:
+    """What nobody is left to tell it: docs/deployment.md says what to do."""
+    with ExitStack() as stack:
+        endpoint = free_endpoint()
+        router = open_router("lab", [endpoint])
+        repeat_tokens(router)
+        first = stack.enter_context(open_bus("lab", [endpoint]))
+        OwnTokens(first, "r1", "1").declare_moved()
+        first.close()
+        router.close()
+        repeat_tokens(stack.enter_context(open_router("lab", [endpoint])))
+        second = stack.enter_context(open_bus("lab", [endpoint]))
+        assert wait_until_alone(second.tokens, "r1") == NEVER_RAN
+
+
 def test_a_second_process_of_a_robot_waits_for_the_first_and_then_gives_up() -> None:
     endpoint = free_endpoint()
     with ExitStack() as stack:

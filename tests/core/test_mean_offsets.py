@@ -113,6 +113,25 @@ def test_a_difference_within_the_noise_is_no_bias() -> None:
     assert bias_variance(at(0.0), at(0.1)) == pytest.approx(0.1**2 - 4e-4)
 
 
+def test_the_bias_of_one_that_is_vague_along_one_axis_is_that_along_the_other() -> None:
+    thin = at(0.1)._replace(covariance=Covariance2(1e-4, 0.0, 0.09))
+    assert bias_variance(at(0.0), thin) == pytest.approx(0.1**2 - 4e-4, abs=1e-4)
+    assert bias_variance(at(0.0), thin._replace(x=0.0, y=0.5)) == 0.0
+
+
+@given(st.floats(0.0, 0.5), st.floats(0.01, 0.3), st.floats(-math.pi, math.pi))
+def test_a_bias_is_no_longer_than_the_difference_and_turns_with_it(
+    length: float, sigma: float, angle: float
+) -> None:
+    def turned(by: float) -> MeanOffset:
+        covariance = Covariance2(1e-4, 0.0, sigma * sigma).rotated(by)
+        return MeanOffset(length * math.cos(1.0 + by), length * math.sin(1.0 + by), covariance)
+
+    bias = bias_variance(at(0.0), turned(0.0))
+    assert bias <= length * length
+    assert bias == pytest.approx(bias_variance(at(0.0), turned(angle)), rel=1e-6, abs=1e-9)
+
+
 def test_the_error_of_the_position_is_added_to_the_noise() -> None:
     """Against the general form: the inverse of the matrix grows by the covariance."""
     random_ = np.random.default_rng(2)

@@ -116,7 +116,7 @@ def test_a_sender_in_conflict_with_odometry_does_not_count_against_one_that_is_n
         last_report_ns=now_ns - 1, dispute_since_ns=9 * SECOND, score=40.0, mean_offset=(1.0, 0.0)
     )
     senders = {
-        "conflicting": replace(dissenter, odometry_conflicts=1.0),
+        "conflicting": replace(dissenter, odometry_conflicts=1.0, last_conflict_ns=8 * SECOND),
         "other": dissenter,
         "honest": SenderRecord(last_report_ns=now_ns - 1, last_agreement_ns=now_ns - 1),
     }
@@ -126,12 +126,37 @@ def test_a_sender_in_conflict_with_odometry_does_not_count_against_one_that_is_n
     assert (decision.event, decision.quarantined, decision.trusted) == ("", frozenset(), False)
     senders = {
         **senders,
-        "other": replace(dissenter, odometry_conflicts=1.0),
+        "other": replace(dissenter, odometry_conflicts=1.0, last_conflict_ns=8 * SECOND),
     }  # without a dissenter that counts
     decision = assess(
         senders, "other", TeammateReport(now_ns, CONTRADICTS, (1.0, 0.0)), now_ns - 1, RULES
     )
     assert decision.quarantined == {"other"}
+
+
+@pytest.mark.parametrize(
+    ("conflicts", "conflict_s", "outvoted"),
+    [(0.6, 5.0, {"liar"}), (0.6, 8.0, set()), (1.6, 5.0, set())],
+    ids=["long before", "as it began", "repeated"],
+)
+def test_one_conflict_long_before_a_dispute_takes_no_vote(
+    conflicts: float, conflict_s: float, outvoted: set[str]
+) -> None:
+    """One distance that odometry contradicted by chance took the vote of one of two correct
+    senders, and a liar led a blind robot astray by ten times its error."""
+    now_ns = 10 * SECOND
+    dissenter = SenderRecord(
+        last_report_ns=now_ns - 1, dispute_since_ns=9 * SECOND, score=40.0, mean_offset=(1.0, 0.0)
+    )
+    senders = {
+        "north": replace(
+            dissenter, odometry_conflicts=conflicts, last_conflict_ns=round(conflict_s * SECOND)
+        ),
+        "south": dissenter,
+        "liar": SenderRecord(last_report_ns=now_ns - 1, last_agreement_ns=now_ns - 1),
+    }
+    report = TeammateReport(now_ns, CONTRADICTS, (1.0, 0.0))
+    assert assess(senders, "south", report, now_ns - 1, RULES).quarantined == outvoted
 
 
 def test_odometry_decides_between_two_senders(receiver: Receiver) -> None:

@@ -14,6 +14,7 @@ with the faulty robot's own name, only its beliefs.
 | `jumps:1.5` | its position is shifted by so many metres, every 2 s in another direction |
 | `overconfident:0.3` | its position has an error of this sigma (m), but it states 1 mm |
 | `drift:0.01,0.0,0.02` | its error grows by these m/s in x and y, and it states this sigma (m) |
+| `one-axis:0.02,0.01,0.2` | its error grows by these m/s in x; it states these sigmas in x and y |
 | `heading:2.0,0.5` | its heading turns by these deg/s, and it states this sigma (deg) |
 | `clock:0.5` | its stamp is so many seconds too late (negative: too early) |
 
@@ -46,6 +47,7 @@ VALUE_COUNTS = {
     "jumps": 1,
     "overconfident": 1,
     "drift": 3,
+    "one-axis": 3,
     "heading": 2,
     "clock": 1,
 }
@@ -53,7 +55,7 @@ JUMP_NS = 2_000_000_000
 STATED_SIGMA_M = 0.001
 _HELP_KEYS = ("fix/", "belief/", "landmark/")
 _TEXT = re.compile(
-    r"(?P<kind>[a-z]+)(:(?P<values>[^@/]*))?(/(?P<about>[^@/]+))?"
+    r"(?P<kind>[a-z-]+)(:(?P<values>[^@/]*))?(/(?P<about>[^@/]+))?"
     r"(@(?P<since>[^-@]+)-(?P<until>[^-@]*))?"
 )
 
@@ -110,17 +112,19 @@ class FaultInjector:
         message = replace(message, x_m=message.x_m + dx, y_m=message.y_m + dy)
         if self._fault.kind in ("drift", "overclaim"):
             return _with_stated_sigma(message, self._fault.values[2])
+        if self._fault.kind == "one-axis":
+            return _with_stated_sigma(message, *self._fault.values[1:])
         is_tiny = self._fault.kind == "overconfident"
         return _with_stated_sigma(message, STATED_SIGMA_M) if is_tiny else message
 
     def _offset(self, stamp_ns: int) -> tuple[float, float]:
         """Metres in x and y."""
-        first, *_ = self._fault.values
+        first, *others = self._fault.values
         if self._fault.kind in ("bias", "overclaim"):
-            return first, self._fault.values[1]
-        if self._fault.kind == "drift":
+            return first, others[0]
+        if self._fault.kind in ("drift", "one-axis"):
             since_s = (stamp_ns - self._start_ns) * 1e-9 - self._fault.from_s
-            return first * since_s, self._fault.values[1] * since_s
+            return first * since_s, others[0] * since_s if self._fault.kind == "drift" else 0.0
         if self._fault.kind == "overconfident":
             return self._random.gauss(0.0, first), self._random.gauss(0.0, first)
         jump = (stamp_ns - self._start_ns) // JUMP_NS
@@ -140,14 +144,18 @@ def _subject(message: Help) -> str:
     return message.landmark if isinstance(message, LandmarkBelief) else message.robot
 
 
-def _with_stated_sigma(message: Help, sigma_m: float) -> Help:
+def _with_stated_sigma(message: Help, sigma_m: float, vague_m: float | None = None) -> Help:
+    """With this sigma along both axes, or with another one along y. Of a fix the larger one is the
+    observer's own, for the mean of many fixes is as vague as that."""
     variance = sigma_m**2
+    along_y = variance if vague_m is None else vague_m**2
+    position = (variance, 0.0, along_y)
     if isinstance(message, Fix):
-        position = (variance, 0.0, variance)
-        return replace(message, sensor_covariance=position, observer_covariance=position)
+        sensor = (variance, 0.0, variance)
+        return replace(message, sensor_covariance=sensor, observer_covariance=position)
     if isinstance(message, LandmarkBelief):
-        return replace(message, covariance=(variance, 0.0, variance))
-    return replace(message, covariance=(variance, 0.0, variance, 0.0, 0.0, variance))
+        return replace(message, covariance=position)
+    return replace(message, covariance=(*position, 0.0, 0.0, variance))
 
 
 def _with_heading(message: Help, for_s: float, turn_deg_s: float, sigma_deg: float) -> Help:

@@ -2,7 +2,8 @@
 
 It is an attacker with a valid name that knows the truth: ten times a second it sends every victim a
 fix, and its own belief, as a `Fault` alters them. It is a strong liar, because it sees its victims
-everywhere and spends no budget.
+everywhere and spends no budget. It may read the poses that they publish, as every member may, and
+say nothing that their gates would reject.
 """
 
 import math
@@ -18,12 +19,13 @@ from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus
 from cpcbl_transport.compact import encode_help
 from cpcbl_transport.decoding import Received, Subscriber
-from cpcbl_transport.messages import Truth, Truths
+from cpcbl_transport.messages import Pose, Row3, Truth, Truths
 
 PERIOD_NS: Final = 100_000_000
 SIGMA_M = 0.01  # per axis, of its sightings and of its own position together
 HEADING_SIGMA = math.radians(1.0)
 TIER = 0
+GATE_SIGMAS = 2.0  # no fix is farther from the victim's pose than this
 
 
 class LyingObserver:
@@ -32,7 +34,8 @@ class LyingObserver:
     def __init__(
         self, bus: Bus, name: str, victims: Sequence[str], fault: Fault, seed: int, sends: str
     ) -> None:
-        """`sends`: "fixes", "headings" (fixes with a heading) or "beliefs"."""
+        """`sends`: "fixes", "headings" (fixes with a heading), "gated" (fixes within the gate of
+        the victim's own pose) or "beliefs"."""
         self.next_ns = 0
         self.waiting = False
         self._name, self._sends = name, sends
@@ -45,6 +48,9 @@ class LyingObserver:
         keys = {robot: topics.FIX.at(robot=robot, tier=TIER, observer=name) for robot in victims}
         self._fixes = {robot: bus.publisher(k, topics.FIX.qos) for robot, k in keys.items()}
         self._subscriber = Subscriber(bus, Truths, self._on_message)
+        self._poses: dict[str, Pose] = {}
+        if sends == "gated":
+            self._pose_subscriber = Subscriber(bus, Pose, self._on_pose)
 
     def step(self, now_ns: int) -> None:
         """Sends what it says of the robots as they were when the truth was last published."""
@@ -61,8 +67,15 @@ class LyingObserver:
     def _on_message(self, received: Received[Truths]) -> None:
         self._truths = received.message
 
+    def _on_pose(self, received: Received[Pose]) -> None:
+        self._poses[received.message.robot] = received.message
+
     def _lie(self, message: Belief | Fix) -> bytes:
-        return encode_help(self._injector.alter(message))
+        altered = self._injector.alter(message)
+        pose = self._poses.get(altered.robot)
+        if isinstance(altered, Fix) and pose is not None and pose.covariance is not None:
+            altered = _within_gate(altered, pose, pose.covariance)
+        return encode_help(altered)
 
     def _fix_of(self, truth: Truth, stamp_ns: int) -> Fix:
         x, y = (v + self._random.gauss(0.0, SIGMA_M) for v in (truth.x_m, truth.y_m))
@@ -83,3 +96,18 @@ class LyingObserver:
         part, turn = SIGMA_M**2, HEADING_SIGMA**2
         pose = truth.x_m, truth.y_m, truth.heading_rad
         return Belief(self._name, stamp_ns, *pose, (part, 0.0, part, 0.0, 0.0, turn))
+
+
+def _within_gate(fix: Fix, pose: Pose, covariance: tuple[Row3, Row3, Row3]) -> Fix:
+    """The fix, moved along each axis until the robot with this pose would accept it."""
+    (xx, _, _), (_, yy, _), _ = covariance
+    (of_x, _, of_y), (more_x, _, more_y) = fix.sensor_covariance, fix.observer_covariance
+    return replace(
+        fix,
+        x_m=_clipped(fix.x_m, pose.x_m, GATE_SIGMAS * math.sqrt(xx + of_x + more_x)),
+        y_m=_clipped(fix.y_m, pose.y_m, GATE_SIGMAS * math.sqrt(yy + of_y + more_y)),
+    )
+
+
+def _clipped(value: float, around: float, most: float) -> float:
+    return min(max(value, around - most), around + most)

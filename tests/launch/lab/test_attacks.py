@@ -10,7 +10,10 @@ from cpcbl_launch.lab.experiments import attacks
 from cpcbl_launch.lab.experiments.attacks import Attack, AttackRow, attack_rows, run_attack
 
 EVERY = {(attack.name, attack.victim): attack for attack in attacks.attacks()}
-SHORT = [("drift", "scout"), ("headings", "navigator"), ("no majority", "scout")]
+SHORT = [
+    *(("drift", "scout"), ("headings", "navigator"), ("no majority", "scout")),
+    ("one axis", "scout"),
+]
 SHORT_S = 35.0
 
 pytestmark = pytest.mark.timeout(300)
@@ -49,6 +52,16 @@ def test_without_a_majority_the_robot_says_so_and_its_sigma_holds(
     assert row.noticed == 1
     assert row.least_inside_3_sigma > attacks.LEAST_INSIDE
     assert row.worst_ratio > 1.3  # nobody could find out
+
+
+def test_one_that_is_certain_along_one_axis_only_leads_nobody_astray(
+    short: dict[tuple[str, str], AttackRow],
+) -> None:
+    """It was too vague to be compared with others, and had weight all the same."""
+    row = short["one axis", "scout"]
+    assert row.held
+    assert row.worst_ratio < 1.2  # 6.5 before, with a correct observer in quarantine
+    assert row.false_quarantines == 0
 
 
 def test_the_runs_to_compare_with_have_no_liar(short: dict[tuple[str, str], AttackRow]) -> None:

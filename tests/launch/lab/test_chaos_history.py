@@ -127,6 +127,16 @@ def test_a_robot_that_says_that_it_is_lost_claims_nothing() -> None:
     assert longest_false_claim_s(left_out, "a") == 0.0
 
 
+def test_a_claim_does_not_go_on_through_a_time_that_is_not_judged() -> None:
+    wrong = tracks_of("a", lambda s: 1.0 if 20.0 <= s < 40.0 else 0.0)
+    judged = without(run_log_of([wrong]), [Span("a", 22.0, 37.0)])
+    assert longest_false_claim_s(judged, "a") == pytest.approx(2.9)  # from 37 s on
+    twice = without(judged, [Span("a", 38.0, 39.0)])
+    assert longest_false_claim_s(twice, "a") == pytest.approx(1.9)  # before 22 s
+    lost_between = tracks_of("a", lambda s: 1.0 if 20.0 <= s < 40.0 else 0.0, lost=(22.0, 37.0))
+    assert longest_false_claim_s(run_log_of([lost_between]), "a") == pytest.approx(2.9)
+
+
 def test_a_history_is_written_as_lines_of_json(tmp_path: Path) -> None:
     (fault, *_), path = schedule(1, 60.0, TARGETS, INSTANT), tmp_path / "what.jsonl"
     log = run_log_of([tracks_of("a")], [token_appeared(1.0, "a")], [status_at("a", 2.0)])

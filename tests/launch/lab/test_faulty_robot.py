@@ -74,8 +74,28 @@ def test_a_text_that_is_no_fault_is_refused_with_an_example(text: str) -> None:
         Fault.parse(text)
 
 
+def test_one_axis_states_that_it_is_vague_along_the_other() -> None:
+    faulty = injector("one-axis:0.02,0.005,0.25@10-")
+    altered = faulty.alter(fix(20.0))
+    assert isinstance(altered, Fix)
+    assert (altered.x_m, altered.y_m) == pytest.approx((1.2, 2.0))
+    assert altered.sensor_covariance == pytest.approx((0.005**2, 0.0, 0.005**2))
+    assert altered.observer_covariance == pytest.approx((0.005**2, 0.0, 0.25**2))
+    said = faulty.alter(belief(20.0))
+    assert isinstance(said, Belief)
+    assert said.covariance[:3] == pytest.approx((0.005**2, 0.0, 0.25**2))
+
+
 def test_messages_are_unchanged_before_and_after_the_fault() -> None:
-    for kind in ("bias:1,1", "frozen", "jumps:1", "overconfident:1", "clock:1", "drift:1,0,0.1"):
+    for kind in (
+        "bias:1,1",
+        "frozen",
+        "jumps:1",
+        "overconfident:1",
+        "clock:1",
+        "drift:1,0,0.1",
+        "one-axis:1,1,1",
+    ):
         faulty = injector(f"{kind}@10-20")
         for at_s in (0.0, 9.9, 20.0, 30.0):
             assert faulty.alter(fix(at_s)) == fix(at_s)

@@ -1,5 +1,7 @@
 """Invariants of a team's history, whatever happened to it. Pure functions of what was received."""
 
+import math
+from bisect import bisect_left
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -75,11 +77,12 @@ def _key(token: TokenEvent) -> tuple[str, str]:
 
 def without(log: RunLog, spans: Iterable[Span]) -> RunLog:
     """The log without the tracks that arrived in these times."""
-    tracks = dict(log.tracks)
-    for span in spans:
-        kept = tracks.get(span.robot, ())
-        tracks[span.robot] = [t for t in kept if not span.from_s <= t.at_s < span.until_s]
-    return log._replace(tracks=tracks)
+    tracks, left_out = dict(log.tracks), dict(log.left_out)
+    for robot, from_s, until_s in spans:
+        kept = tracks.get(robot, ())
+        tracks[robot] = [t for t in kept if not from_s <= t.at_s < until_s]
+        left_out[robot] = [*left_out.get(robot, ()), (from_s, until_s)]
+    return log._replace(tracks=tracks, left_out=left_out)
 
 
 def honest(log: RunLog) -> RunLog:
@@ -159,12 +162,17 @@ def check_claims(log: RunLog, robots: Sequence[str], least_m: float = DISHONEST_
 
 def longest_false_claim_s(log: RunLog, robot: str, least_m: float = DISHONEST_M) -> float:
     """The longest time in which a robot said that it was not lost, and was wrong by 5 sigma and by
-    `least_m`: a lost robot must say so."""
+    `least_m`: a lost robot must say so. A claim ends where it said so, and where a time begins that
+    is not judged: what it says afterwards is a new one."""
+    ends_s = [t.stamp_s for t in log.tracks.get(robot, ()) if t.track.lost]
+    ends_s = sorted([*ends_s, *(from_s for from_s, _ in log.left_out.get(robot, ()))])
     since_s: float | None = None
-    longest_s = 0.0
+    longest_s, last_s = 0.0, -math.inf
     for stamp_s, error_m, nees in honest(log).errors(robot):
+        is_new = bisect_left(ends_s, last_s) < bisect_left(ends_s, stamp_s)
+        last_s = stamp_s
         if error_m > least_m and nees > DISHONEST_SIGMAS**2:
-            since_s = stamp_s if since_s is None else since_s
+            since_s = stamp_s if since_s is None or is_new else since_s
             longest_s = max(longest_s, stamp_s - since_s)
         else:
             since_s = None

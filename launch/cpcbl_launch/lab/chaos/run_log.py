@@ -56,6 +56,8 @@ class RunLog(NamedTuple):
     tokens: Sequence[TokenEvent]
     truth: Mapping[str, Floats]  # rows of seconds, x, y, heading, by robot
     machine: MachineLog = IDLE
+    left_out: Mapping[str, Sequence[tuple[float, float]]] = MappingProxyType({})
+    """By robot, the times (from, until) whose tracks are not judged, and not here."""
 
     # Tokens -------------------------------------------------------------------------------------
 

@@ -31,6 +31,7 @@ from cpcbl_transport.memory_bus import MemoryHub
 HONEST = ("north", "south")
 ONE, TWO, GUEST = ("west",), ("west", "east"), ("ghost",)
 DRIFT = "drift:0.01,0.0,0.01"  # 1 cm/s, and it states 1 cm
+ONE_AXIS = "one-axis:0.02,0.005,0.25"  # 2 cm/s in x, where it states 5 mm, and 25 cm in y
 LEAST_INSIDE = 0.95  # of the victim's samples within 3 sigma, where nobody can find the liars
 OWN_EYES_RATIO, BLIND_RATIO = 1.3, 1.5
 NAVIGATOR = {"victim": "navigator", "most_ratio": OWN_EYES_RATIO}
@@ -90,6 +91,7 @@ def attacks() -> tuple[Attack, ...]:
         Attack(name="sleeper", lie=DRIFT, from_s=120.0, end_s=180.0),
         Attack(name="beliefs", lie=DRIFT, sends="beliefs"),
         Attack(name="headings", lie="heading:1.0,1.0", sends="headings"),
+        Attack(name="one axis", lie=ONE_AXIS, sends="gated"),
     )
     cases = [replace(kind, liars=ONE) for kind in kinds]
     cases += [replace(kind, liars=TWO, **NAVIGATOR) for kind in kinds]

@@ -8,6 +8,7 @@ from contextlib import contextmanager
 
 import msgspec
 
+from cpcbl_launch.lab.chaos.history import honest
 from cpcbl_launch.lab.luck.history import History, Kind
 from cpcbl_launch.lab.luck.plan import history_of
 from cpcbl_launch.lab.luck.simulator import Simulation
@@ -49,7 +50,7 @@ def _outcome_of(history: History, stop_early: bool) -> Outcome:
     if not (stop_early and broken) and all(v.invariant != "no exception" for v in broken):
         broken += tuple(violations(run.log, history, simulation.team))
     names, team = filter(is_blind, history.robots), simulation.team
-    log = without_unknowable(run.log, history, team)
+    log = honest(without_unknowable(run.log, history, team))
     blind = [c for n in names if (c := consistency_of(log, n, tracks_hz(team, n)))]
     samples = sum(c.independent for c in blind)
     nees = sum(c.nees * c.independent for c in blind) / max(samples, 1.0)

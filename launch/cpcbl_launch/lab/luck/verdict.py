@@ -6,7 +6,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from cpcbl_launch.lab.chaos.consistency import Consistency, consistency
-from cpcbl_launch.lab.chaos.history import longest_false_claim_s
+from cpcbl_launch.lab.chaos.history import honest, longest_false_claim_s
 from cpcbl_launch.lab.chaos.run_log import TRACKS_HZ, RunLog
 from cpcbl_launch.lab.luck.history import Event, History, Kind
 from cpcbl_launch.lab.luck.processes import RESTART_S
@@ -35,9 +35,10 @@ UNKNOWABLE: tuple[Kind, ...] = ("liar", "clock-step", "kidnap", "odd-sightings",
 def violations(log: RunLog, history: History, team: Team) -> Iterator[Violation]:
     """What did not hold."""
     yield from _waiting(log, history, team)
-    trusted = without_unknowable(log, history, team)
+    judged = without_unknowable(log, history, team)
+    trusted = honest(judged)
     for name in history.robots:
-        false_s = longest_false_claim_s(trusted, name, FALSE_M)
+        false_s = longest_false_claim_s(judged, name, FALSE_M)
         if false_s > FALSE_S:
             what = f"it was wrong by 5 sigma for {false_s:.1f} s and did not say so"
             yield Violation("lost honestly", name, history.duration_s, what)
@@ -146,8 +147,8 @@ def noticeable_s(log: RunLog, carried: Event) -> float:
 
 
 def without_unknowable(log: RunLog, history: History, team: Team) -> RunLog:
-    """The log without the tracks of robots that said that they were lost, and without those of
-    times of which no robot can know that its inputs or its help are wrong."""
+    """The log without the tracks of times of which no robot can know that its inputs or its help
+    are wrong."""
     settling_s = max(SETTLING_S, frames_s(team))
     step_s = 1.0 / team.simulation.step_rate_hz  # truth between two steps is no pose where it jumps
     spans = [
@@ -155,12 +156,10 @@ def without_unknowable(log: RunLog, history: History, team: Team) -> RunLog:
         for e in history.of_kind(*UNKNOWABLE)
     ]
     tracks = {
-        name: [
-            t for t in tracks if not t.track.lost and not any(a <= t.stamp_s < b for a, b in spans)
-        ]
+        name: [t for t in tracks if not any(a <= t.stamp_s < b for a, b in spans)]
         for name, tracks in log.tracks.items()
     }
-    return log._replace(tracks=tracks)
+    return log._replace(tracks=tracks, left_out=dict.fromkeys(tracks, spans))
 
 
 def tracks_hz(team: Team, robot: str) -> float:
