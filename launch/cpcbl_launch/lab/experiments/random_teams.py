@@ -28,14 +28,8 @@ from cpcbl_team.config import (
 LENGTHS_M = 3.0, 6.0, 8.0, 15.0, 30.0
 LANDMARKS = 0, 1, 2, 3, 4, 6, 10, 20
 ROBOTS = 1, 2, 3, 4, 6
-KINDS: tuple[Gives | None, ...] = (
-    "both",
-    "both",
-    "range",
-    "bearing",
-    None,
-)  # None: of each one's own
 GIVES: tuple[Gives, ...] = "both", "range", "bearing"
+KINDS: tuple[tuple[Gives, ...], ...] = ("both",), ("both",), ("range",), ("bearing",), GIVES
 VARIANTS: tuple[Variant, ...] = "joint", "joint", "joint", "oval", "circular"
 WITH_WALLS, BLIND, STANDING, WITH_POSITIONS = 0.2, 0.5, 0.15, 0.1  # shares
 WALL_M = 0.3  # from the field to a wall
@@ -77,12 +71,12 @@ def with_drawn_starts(team: Team, seed: int) -> Team:
 
 def _field(random: Random, size_m: tuple[float, float]) -> Field:
     width, height = size_m
-    number, kind = random.choice(LANDMARKS), random.choice(KINDS)
+    number, kinds = random.choice(LANDMARKS), random.choice(KINDS)
     marks = {
         f"m{i}": Landmark(
             x_m=random.uniform(0.0, width),
             y_m=random.uniform(0.0, height),
-            gives=kind or random.choice(GIVES),
+            gives=random.choice(kinds) if len(kinds) > 1 else kinds[0],
         )
         for i in range(number)
     }
