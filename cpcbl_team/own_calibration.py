@@ -154,7 +154,8 @@ class OwnCalibration:
             here_x, here_y, heading = here
             dx, dy = x - here_x, y - here_y
             sums.add(name, dx, dy, heading, range_m, bearing, k * sigma_m, k * sigma_rad)
-        return with_calibration(state, memory._replace(residuals=sums.residuals()))
+        residuals = sums.residuals(state.estimate.covariance)
+        return with_calibration(state, memory._replace(residuals=residuals))
 
     def _with_ranges(self, state: State) -> State:
         """The state that has compared distances between landmarks with the map, once a block."""
