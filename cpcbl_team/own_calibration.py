@@ -20,6 +20,7 @@ from cpcbl_team.miscalibration import (
     LEAST_DISTANCE_M,
     LEAST_PARTS,
     STEP_NS,
+    UNSETTLED,
     Adaptation,
     Corrected,
     ModelCheck,
@@ -210,9 +211,11 @@ class OwnCalibration:
         now = new(Corrected, (now_ns, estimate, place, gaps))
         known = memory.calibration
         check, present, begin = known.check, known.adaptation, known.check.begin
-        if (
-            begin is None
-            or memory.recovery.lost
+        if begin is None:
+            # In its first block the robot corrects what a wide prior left
+            check = check.from_pose(now._replace(gaps=UNSETTLED))
+        elif (
+            memory.recovery.lost
             or odometry_until_ns < now_ns
             or memory.teammates.last_report_ns >= begin.stamp_ns
         ):
