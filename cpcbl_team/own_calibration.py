@@ -211,11 +211,13 @@ class OwnCalibration:
         now = new(Corrected, (now_ns, estimate, place, gaps))
         known = memory.calibration
         check, present, begin = known.check, known.adaptation, known.check.begin
-        if begin is None:
-            # In its first block the robot corrects what a wide prior left
+        if begin is None and not check.accepted:
+            # In its first block the robot corrects what a wide prior left. Not after it was lost:
+            # that may be by the very error that blocks shall tell, time after time
             check = check.from_pose(now._replace(gaps=UNSETTLED))
         elif (
-            memory.recovery.lost
+            begin is None
+            or memory.recovery.lost
             or odometry_until_ns < now_ns
             or memory.teammates.last_report_ns >= begin.stamp_ns
         ):
