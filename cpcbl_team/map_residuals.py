@@ -4,6 +4,9 @@ An error of the map may be within the gates. But readings of a right map err abo
 mean tells what no single one does: the offset of an object from its place, by least squares. The
 wrong place moves the robot's estimate too, and with it the offsets of all other objects; the
 largest is that of the wrong one, if it was seen from many sides.
+
+The robot's own error is in all readings of a block alike: however many there are, they do not tell
+the offset better than the robot knows its pose.
 """
 
 import math
@@ -11,6 +14,7 @@ from collections.abc import Mapping
 from typing import Final, NamedTuple
 
 from cpcbl_team.constraints import NEAREST_M, circle, heading
+from cpcbl_team.estimate import Covariance3
 from cpcbl_team.geometry import new
 
 KEPT: Final = 1.0 - 1.5 / 120.0  # of all sums, after a block of 1.5 s
@@ -72,7 +76,7 @@ def misplaced_object(offsets: Mapping[str, Offset]) -> str:
 
 
 class OffsetSums:
-    """The normal equations of the offset of one object, to which readings are added."""
+    """The normal equations of the offset of one object, to which blocks are added."""
 
     def __init__(self, before: Offset) -> None:
         self.xx, self.xy, self.yy, self.x, self.y, self.readings, self.squares = before
@@ -84,7 +88,42 @@ class OffsetSums:
         self.x, self.y = KEPT * self.x, KEPT * self.y
         self.readings, self.squares = KEPT * self.readings, KEPT * self.squares
 
-    def add(self, u: float, v: float, residual: float, weight: float) -> None:
+    def add_block(self, block: "BlockSums", pose: Covariance3) -> None:
+        """Adds the readings of a block, in which the error of the pose is one for all.
+
+        With the information I and the vector b of the readings, and the covariance P of where the
+        pose puts the object, they tell (I^-1 + P)^-1 = (1 + I P)^-1 I and (1 + I P)^-1 b.
+        """
+        xx, xy, yy, n = block.xx, block.xy, block.yy, max(block.readings, 1.0)
+        east, north = block.east / n, block.north / n
+        pxx, pxy, pyy = pose.projected(((1.0, 0.0, -north), (0.0, 1.0, east)))
+        a, b = 1.0 + xx * pxx + xy * pxy, xx * pxy + xy * pyy
+        c, d = xy * pxx + yy * pxy, 1.0 + xy * pxy + yy * pyy
+        k = 1.0 / (a * d - b * c)
+        self.xx += k * (d * xx - b * xy)
+        self.xy += k * (d * xy - b * yy)
+        self.yy += k * (a * yy - c * xy)
+        self.x += k * (d * block.x - b * block.y)
+        self.y += k * (a * block.y - c * block.x)
+        self.readings += block.readings
+        self.squares += block.squares
+
+    def offset(self) -> Offset:
+        sums = self.xx, self.xy, self.yy, self.x, self.y, self.readings, self.squares
+        return new(Offset, sums)
+
+
+class BlockSums:
+    """The same of the readings of one block alone, and the sum of the object's displacements from
+    the robot (m)."""
+
+    def __init__(self) -> None:
+        self.xx = self.xy = self.yy = self.x = self.y = self.readings = self.squares = 0.0
+        self.east = self.north = 0.0
+
+    def add(
+        self, u: float, v: float, residual: float, weight: float, east: float, north: float
+    ) -> None:
         """Adds a reading that the offset (x, y) changes by u x + v y."""
         self.xx += weight * u * u
         self.xy += weight * u * v
@@ -93,10 +132,8 @@ class OffsetSums:
         self.y += weight * v * residual
         self.readings += 1.0
         self.squares += weight * residual * residual
-
-    def offset(self) -> Offset:
-        sums = self.xx, self.xy, self.yy, self.x, self.y, self.readings, self.squares
-        return new(Offset, sums)
+        self.east += east
+        self.north += north
 
 
 class ResidualSums:
@@ -104,6 +141,7 @@ class ResidualSums:
 
     def __init__(self, before: MapResiduals) -> None:
         self._of_object = {name: OffsetSums(offset) for name, offset in before.of_object.items()}
+        self._of_block: dict[str, BlockSums] = {}
         for sums in self._of_object.values():
             sums.fade()
 
@@ -121,9 +159,9 @@ class ResidualSums:
         """Adds what was read of an object that is (dx, dy) from the robot on the map (m, in the
         field's frame), with the robot's heading there and the sigmas of the sensor. An outlier,
         and an object that is too near to have a direction, tell nothing."""
-        sums = self._of_object.get(name)
+        sums = self._of_block.get(name)
         if sums is None:
-            sums = self._of_object[name] = OffsetSums(NO_OFFSET)
+            sums = self._of_block[name] = BlockSums()
         distance = math.hypot(dx, dy)
         if distance < NEAREST_M:
             return
@@ -138,10 +176,16 @@ class ResidualSums:
             of_bearing = 1.0 / max(bearing_sigma_rad * bearing_sigma_rad, 1e-12)
             if of_bearing * turn * turn > FARTHEST:
                 return
-            sums.add(across, along, turn, of_bearing)
+            sums.add(across, along, turn, of_bearing, dx, dy)
         if range_m is not None:
-            sums.add(u, v, residual, weight)
+            sums.add(u, v, residual, weight, dx, dy)
 
-    def residuals(self) -> MapResiduals:
+    def residuals(self, pose: Covariance3) -> MapResiduals:
+        """What the blocks tell, this one with the covariance of the robot's pose."""
+        for name, block in self._of_block.items():
+            sums = self._of_object.get(name)
+            if sums is None:
+                sums = self._of_object[name] = OffsetSums(NO_OFFSET)
+            sums.add_block(block, pose)
         offsets = {name: sums.offset() for name, sums in self._of_object.items()}
         return MapResiduals(offsets, misplaced_object(offsets))

@@ -43,6 +43,8 @@ BELIEF_VALID_BEFORE_NS = 500_000_000
 """A belief is also used for sightings of up to this time before it: a robot subscribes to a
 teammate's beliefs when it sees it, and what it saw before the first one came must not be lost."""
 
+DRIVES_ON_M = 1.0  # a robot that turns by a radian a second may drive on at a metre a second
+
 
 # Where a teammate is: one whose belief was received is one more landmark --------------------------
 
@@ -68,13 +70,15 @@ def position_by_belief(belief: Belief, at_ns: int) -> ObjectPosition:
     """The position of a belief's robot at another time.
 
     A third of the extrapolated distance is added to its sigma, because it may have stopped or
-    turned.
+    turned; and of that at `DRIVES_ON_M` times its turn rate, because one that turned on the spot
+    may drive on. Its next belief may not come: with a wide heading it soon helps nobody.
     """
     pose, age = extrapolated(belief, at_ns), (at_ns - belief.stamp_ns) * 1e-9
     covariance = Covariance3(*belief.covariance)
     jacobian = (1.0, 0.0, belief.y_m - pose.y, 0.0, 1.0, pose.x - belief.x_m, 0.0, 0.0, 1.0)
     xx, xy, yy, *_ = covariance.transformed(jacobian)
-    growth = (belief.speed_m_s * age / 3.0) ** 2
+    possible_m_s = math.hypot(belief.speed_m_s, DRIVES_ON_M * belief.turn_rate_rad_s)
+    growth = (possible_m_s * age / 3.0) ** 2
     return ObjectPosition(pose.x, pose.y, Covariance2(xx + growth, xy, yy + growth))
 
 

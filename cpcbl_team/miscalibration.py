@@ -43,7 +43,7 @@ from cpcbl_team.estimate import (
     Six,
 )
 from cpcbl_team.geometry import Pose2, new, wrap_angle
-from cpcbl_team.motion import covariance_after, distance_variance, turn_variance
+from cpcbl_team.motion import covariance_after, distance_variance, shortening, turn_variance
 from cpcbl_team.range_errors import NO_RANGE_ERRORS, RangeErrors
 
 _atan2: Final = math.atan2  # see `constraints._atan2`
@@ -75,6 +75,7 @@ LEAST_REJECTED: Final = 0.01  # share of objects of the map
 LEAST_REJECTIONS: Final = 3
 MOST_DUE: Final = 5.0  # times the share that the gate rejects of correct measurements
 MOST_FACTOR: Final = 400.0  # of a variance
+UNSETTLED: Final = -1
 UNITS: Final = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
@@ -84,7 +85,7 @@ class Corrected(NamedTuple):
     stamp_ns: int
     estimate: Estimate
     odometry_from_robot: Pose2
-    gaps: int  # in the odometry until then
+    gaps: int  # in the odometry until then; UNSETTLED: the block from here tells nothing
 
 
 class ModelCheck(NamedTuple):
@@ -94,7 +95,7 @@ class ModelCheck(NamedTuple):
     sensitivity: Matrix3 = INSENSITIVE
     """The error of the pose for an error of one in each of the constant errors (columns)."""
     evidence: Evidence = Evidence()
-    rejections: int = 0  # of objects of the map,
+    rejections: int = 0  # frames with rejected objects of the map,
     rejected: str = ""  # the last of which is this one,
     accepted: int = 0  # since so many observations were accepted
     doubts: Row = NO_ERRORS  # variances of constant errors that the settings may still have
@@ -128,10 +129,11 @@ class ModelCheck(NamedTuple):
         return new(ModelCheck, check)
 
     def with_rejections(self, names: Sequence[str]) -> "ModelCheck":
-        """With more rejected objects of the map. One that is rejected time after time, while
-        others are accepted, stands elsewhere than on the map: this tells nothing of the robot."""
-        others = sum(name != self.rejected for name in names)
-        return self._replace(rejections=self.rejections + others, rejected=names[-1])
+        """With the rejected objects of one more frame. They count once, for one error of the pose
+        is in all of them. One that is rejected time after time, while others are accepted, stands
+        elsewhere than on the map: this tells nothing of the robot."""
+        is_another = any(name != self.rejected for name in names)
+        return self._replace(rejections=self.rejections + is_another, rejected=names[-1])
 
 
 class Adaptation(NamedTuple):
@@ -198,6 +200,9 @@ def check_models(check: ModelCheck, now: Corrected, noise: OdometryNoise) -> Mod
     taken, added = due.plus(left, -1.0), due.plus(before, -1.0)
     course = _atan2(y, x) - place.heading + pose.heading
     c, s = cos(course), sin(course)
+    shortened = shortening(x * x + y * y, before.hh, due.hh - before.hh)
+    curved = Covariance3(c * c, c * s, s * s, 0.0, 0.0, 0.0).scaled(shortened)
+    taken, added = taken.plus(curved), added.plus(curved)
     to_course = c, s, 0.0, -s, c, 0.0, 0.0, 0.0, 1.0
     dx, dy = pose_now.x - predicted.x, pose_now.y - predicted.y
     correction = c * dx + s * dy, c * dy - s * dx, wrap_angle(pose_now.heading - predicted.heading)

@@ -185,3 +185,13 @@ def drift_sigmas(moved: Pose2) -> tuple[float, float]:
     """How far dead reckoning over such a motion errs, roughly (m, rad)."""
     way, turn = math.hypot(moved.x, moved.y), abs(moved.heading)
     return DRIFT_SHARE * (way + 0.3 * turn), DRIFT_SHARE * (turn + 0.3 * way)
+
+
+def shortening(squared_m2: float, hh: float, added: float) -> float:
+    """The mean square (m^2) of what an unknown heading takes from a straight way of this squared
+    length, to second order.
+
+    A way of d ends short by (1/2) the integral of e^2, where the error e has the variance `hh` at
+    its begin, and has gained `added` at its end by a random walk (rad^2).
+    """
+    return 0.25 * squared_m2 * (3.0 * hh * hh + (7.0 * hh * added + 1.75 * added * added) / 3.0)

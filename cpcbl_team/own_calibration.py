@@ -20,6 +20,7 @@ from cpcbl_team.miscalibration import (
     LEAST_DISTANCE_M,
     LEAST_PARTS,
     STEP_NS,
+    UNSETTLED,
     Adaptation,
     Corrected,
     ModelCheck,
@@ -154,7 +155,8 @@ class OwnCalibration:
             here_x, here_y, heading = here
             dx, dy = x - here_x, y - here_y
             sums.add(name, dx, dy, heading, range_m, bearing, k * sigma_m, k * sigma_rad)
-        return with_calibration(state, memory._replace(residuals=sums.residuals()))
+        residuals = sums.residuals(state.estimate.covariance)
+        return with_calibration(state, memory._replace(residuals=residuals))
 
     def _with_ranges(self, state: State) -> State:
         """The state that has compared distances between landmarks with the map, once a block."""
@@ -209,7 +211,11 @@ class OwnCalibration:
         now = new(Corrected, (now_ns, estimate, place, gaps))
         known = memory.calibration
         check, present, begin = known.check, known.adaptation, known.check.begin
-        if (
+        if begin is None and not check.accepted:
+            # In its first block the robot corrects what a wide prior left. Not after it was lost:
+            # that may be by the very error that blocks shall tell, time after time
+            check = check.from_pose(now._replace(gaps=UNSETTLED))
+        elif (
             begin is None
             or memory.recovery.lost
             or odometry_until_ns < now_ns

@@ -41,13 +41,14 @@ from cpcbl_team.localizer import Localizer
 from cpcbl_team.map_rejections import MapRejections
 from cpcbl_team.miscalibration import (
     AS_CONFIGURED,
+    BLOCK_NS,
     Adaptation,
     Corrected,
     ModelCheck,
     Rules,
     adapted,
 )
-from cpcbl_team.motion import motion_noise
+from cpcbl_team.motion import motion_noise, shortening
 from cpcbl_team.sensors import recalibrated
 from cpcbl_team.state import CalibrationMemory, Memory, State
 
@@ -305,6 +306,35 @@ def test_an_object_that_is_rejected_again_and_again_says_nothing() -> None:
         moved = moved.with_rejections([name])
     assert moved.rejections == 4
     assert moved.restarted(7) == ModelCheck(rejected="ne", accepted=7)
+
+
+def test_all_objects_that_one_frame_rejects_count_once() -> None:
+    """One error of the pose is in all of them, as where a turn began within a piece of odometry."""
+    check = ModelCheck().with_rejections(["ne", "sw", "se", "nw"])
+    assert (check.rejections, check.rejected) == (1, "nw")
+
+
+@pytest.mark.parametrize(("hh", "added"), [(0.04, 0.0), (0.0, 0.04), (0.02, 0.03)])
+def test_an_unknown_heading_shortens_a_straight_way(hh: float, added: float) -> None:
+    rng, way_m, parts = np.random.default_rng(5), 0.8, 400
+    begin = math.sqrt(hh) * rng.standard_normal((4000, 1))
+    steps = math.sqrt(added / parts) * rng.standard_normal((4000, parts))
+    short_m = way_m * (1.0 - np.cos(begin + np.cumsum(steps, axis=1)).mean(axis=1))
+    expected = shortening(way_m**2, hh, added)
+    assert float(np.mean(short_m**2)) == pytest.approx(expected, rel=0.15)
+
+
+def test_the_first_block_tells_nothing() -> None:
+    """What a wide prior left after the first frame is corrected in it."""
+    robot = robot_of()
+    state, pose, now, parts = robot.start(0), LOOP_START, 0, []
+    for _ in range(60):
+        state = robot.add_odometry(state, Odometry(now, now + PIECE_NS, 0.05, 0.0))
+        pose, now = step(pose, 0.05, 0.0), now + PIECE_NS
+        state = robot.cycle(state, frame(pose, now))
+        parts.append(state.memory.calibration.check.evidence.parts)
+    first_ns = next(i for i, n in enumerate(parts) if n > 0.0) * PIECE_NS
+    assert 2 * BLOCK_NS <= first_ns < 3 * BLOCK_NS
 
 
 def rejections_of(names: Sequence[str], accepted: int = 100) -> MapRejections:

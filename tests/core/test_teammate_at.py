@@ -105,3 +105,11 @@ def test_extrapolation_never_reduces_the_covariance(
     assert (
         least_eigenvalue(later - matrix2(found(teammate_at([sent], 0, RULES)).covariance)) > -1e-12
     )
+
+
+@pytest.mark.parametrize(("age_s", "driven_m"), [(0.1, 0.08), (0.4, 0.32)])
+def test_a_teammate_that_turned_may_have_driven_on(age_s: float, driven_m: float) -> None:
+    """It turned at 1.5 rad/s when it was last heard, and drives at 0.8 m/s since then."""
+    sent = belief(1.0, 2.0, sigma_m=0.02, turn_rate_rad_s=1.5)
+    position = found(teammate_at([sent], int(age_s * SECOND), RULES))
+    assert 3.0 * math.sqrt(position.covariance.xx) > driven_m

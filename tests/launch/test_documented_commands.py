@@ -112,7 +112,7 @@ WAYS = {
     "cpcbl-team experiment table1 --seeds 20": Way(EXPERIMENT, "long", "--seeds 2"),
     **{
         f"cpcbl-team experiment {name}": ONE_SEED
-        for name in ("liars", "mapping", "worlds", UNCERTAIN, "wrong-maps")
+        for name in ("liars", "mapping", "worlds", UNCERTAIN, "wrong-maps", "random-worlds")
     },
     "cpcbl-team bridge access team.toml > access.json5": Way("access_control"),
     "cpcbl-team bridge ros2 team.toml": LIVE._replace(says="in ROS 2 at", beside="router"),

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Optional
 
 from msgspec.structs import replace
-from typer import Argument, Context, Exit, Option, Typer
+from typer import Argument, Context, Exit, Option, Typer, echo
 
 from cpcbl_launch.commands import options
 from cpcbl_launch.team.requirements import require_matplotlib, require_opencv
@@ -28,6 +28,7 @@ experiment_app = Typer(
 FILE_WIDTH = 110
 
 Seeds = Annotated[int, Option(min=1, help="Runs of each case, each with its own noise.")]
+FromSeed = Annotated[int, Option(min=0, help="The first seed.")]
 Output = Annotated[Path, Option(help="Folder for NAME.json and NAME.png.")]
 
 
@@ -154,6 +155,29 @@ def worlds(
     conduct(experiment.EXPERIMENT._replace(cases=cases), seeds, where, output, as_json)
 
 
+@experiment_app.command("random-worlds")
+def random_worlds(
+    seeds: Annotated[int, Option(min=1, help="Worlds, each of its own seed.")] = 100,
+    from_seed: FromSeed = 0,
+    show: Annotated[
+        Optional[int], Option(min=0, help="Print the team file of this seed, and run nothing.")
+    ] = None,
+    jobs: options.Jobs = None,
+    cluster: options.Cluster = "",
+    output: Output = Path(),
+    as_json: options.AsJson = False,
+) -> None:
+    """Random teams with settings that are right: who errs more than it says, and false alarms."""
+    from cpcbl_launch.lab.experiments import random_worlds as experiment
+    from cpcbl_launch.lab.experiments.random_teams import random_team
+
+    if show is not None:
+        echo(experiment.team_text(random_team(show)), nl=False)
+        return
+    where = options.workers(jobs, cluster)
+    conduct(experiment.EXPERIMENT._replace(first_seed=from_seed), seeds, where, output, as_json)
+
+
 _add_command(
     "mapping",
     "mapping:EXPERIMENT",
@@ -173,7 +197,7 @@ _add_command(
 @experiment_app.command("luck")
 def luck(
     seeds: Annotated[int, Option(min=1, help="Histories, each of its own seed.")] = 20,
-    from_seed: Annotated[int, Option(min=0, help="The first seed.")] = 0,
+    from_seed: FromSeed = 0,
     duration: Annotated[
         float, Option(callback=options.duration, help="Seconds of each history.")
     ] = 60.0,

@@ -160,12 +160,14 @@ class Experiment(NamedTuple):
     run: Callable[[Any, int], Any] = run_case
     needs_opencv: bool = False
     drawn: bool = True
+    first_seed: int = 1
 
     def results(
         self, cases: Mapping[Any, Any], seeds: int, where: Workers, done: Callable[[], None]
     ) -> Results:
-        """These cases with seeds from 1 to `seeds`; `done` is called after each run."""
-        tasks = [(case, seed) for case in cases.values() for seed in range(1, seeds + 1)]
+        """These cases with so many seeds each; `done` is called after each run."""
+        chosen = range(self.first_seed, self.first_seed + seeds)
+        tasks = [(case, seed) for case in cases.values() for seed in chosen]
         runs = run_seeds(self.run, tasks, where, done)
         return {key: runs[i * seeds : (i + 1) * seeds] for i, key in enumerate(cases)}
 
