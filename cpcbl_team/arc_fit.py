@@ -19,7 +19,7 @@ from cpcbl_team.estimate import (
     sharpest,
     symmetric_product,
 )
-from cpcbl_team.geometry import Pose2
+from cpcbl_team.geometry import Pose2, wrap_angle
 from cpcbl_team.relocalization import RIVAL
 
 Scalar = tuple[Row, float, float]
@@ -33,7 +33,7 @@ LEAST_GAIN: Final = 1e-4  # of the chi-square, by a step
 STARTS: Final = (-2.0, -1.0, 1.0, 2.0)  # sigmas of the turn,
 SIDE_STARTS: Final = (-1.5, 1.5)  # and of the offset along each axis, besides the mean
 SMALL_SHARE: Final = 1.0 / 16.0  # of the prior's determinant: much was uncertain
-LIKELY: Final = 4.0  # the chi-square of a fit beside which no other one is looked for
+LIKELY: Final = 2.0  # the chi-square a scalar of a fit beside which no other one is looked for
 APART: Final = 16.27  # the chi-square of another pose (99.9 %, three degrees of freedom)
 
 
@@ -45,15 +45,18 @@ class ArcFit(NamedTuple):
     cost: float
     mean: Row
     covariance: Covariance3
+    measured: int  # scalars: a pose that touches an object has fewer
 
 
 def best_fit(arc: Arc, measure: Measure) -> ArcFit | None:
     """The best fit; None if another pose fits nearly as well."""
     first = _fit(arc, (0.0, 0.0, 0.0), measure)
     is_small_step = first.covariance.determinant() > SMALL_SHARE * arc.covariance.determinant()
-    if is_small_step and first.cost < LIKELY:
+    if is_small_step and first.cost < LIKELY * (1 + first.measured):
         return first
     fits = [first, *(_fit(arc, start, measure) for start in _other_starts(arc))]
+    most = max(fit.measured for fit in fits)
+    fits = [fit for fit in fits if fit.measured == most]
     best = min(fits, key=lambda fit: fit.cost)
     rivals = (fit for fit in fits if fit.cost < best.cost + RIVAL)
     return None if any(_are_apart(best, rival) for rival in rivals) else best
@@ -95,7 +98,7 @@ def _better(arc: Arc, fit: ArcFit, measure: Measure) -> ArcFit | None:
     for _ in range(HALVINGS):
         there = x + k * (to_x - x), y + k * (to_y - y), turn + k * (to_turn - turn)
         found = _at(arc, there, measure)
-        if found.cost < fit.cost:
+        if found.measured == fit.measured and found.cost < fit.cost:
             return found
         k *= 0.5
     return None
@@ -105,18 +108,19 @@ def _at(arc: Arc, offset: Row, measure: Measure) -> ArcFit:
     """The fit at an offset."""
     a, b, c, d, e, f, _, _, _ = arc.jacobian(offset)
     information, cost = InformationSum(), arc.cost(offset)
-    for (u, v, w), residual, variance in measure(arc.at(offset)):
+    scalars = measure(arc.at(offset))
+    for (u, v, w), residual, variance in scalars:
         row = a * u + d * v, b * u + e * v, c * u + f * v + w
         weight = 1.0 / sharpest(variance)
         information.add(*row, residual + dot(row, offset), weight)
         cost += weight * residual * residual
     matrix, vector = information.sums()
     covariance = symmetric_product(posterior_factor(arc.covariance, matrix), arc.covariance)
-    return ArcFit(offset, cost, covariance.times(vector), covariance)
+    return ArcFit(offset, cost, covariance.times(vector), covariance, len(scalars))
 
 
 def _are_apart(best: ArcFit, other: ArcFit) -> bool:
     """Whether another fit is a pose of its own."""
     (x, y, turn), (to_x, to_y, to_turn) = best.offset, other.offset
-    off = to_x - x, to_y - y, to_turn - turn
+    off = to_x - x, to_y - y, wrap_angle(to_turn - turn)
     return dot(off, best.covariance.inverse().times(off)) > APART

@@ -38,20 +38,34 @@ class Gate:
     ) -> tuple[State, GatedObjects]:
         """The constraints of each object, accepted or rejected by the chi-square bound of their
         innovation, and the state about whose estimate they are linear. Where two poses agree with
-        the measurements of a robot with an uncertain heading, none is used."""
+        what a robot with an uncertain heading measures, no object of the map is used."""
         measured = sorted(measurements, key=lambda m: m.source)
         found = self._relinearization.about_best_pose(state, measured)
         if found is None:
-            return state.counted(AMBIGUOUS), GatedObjects([], [])
+            of_teammates = [m for m in measured if m.sender]
+            return state.counted(AMBIGUOUS), self._gated(state, of_teammates, scope, None)
         after, about = found
-        prior, gated = after.estimate, GatedObjects([], [])
+        gated = self._gated(after, measured, scope, about)
+        if about is None or gated.accepted:
+            return after, gated
+        return state, self._gated(state, measured, scope, None)
+
+    def _gated(
+        self,
+        state: State,
+        measured: Iterable[Measurement],
+        scope: Scope,
+        about: Linearization | None,
+    ) -> GatedObjects:
+        prior, gated = state.estimate, GatedObjects([], [])
+        there = prior if about is None else prior._replace(pose=about.pose)
         for m in measured:
             constraints = self._constraints(prior, m, scope, about)
             if constraints:
-                result = gated_object(prior, m, constraints, after.common_errors)
+                result = gated_object(there, m, constraints, state.common_errors)
                 is_accepted = result.nis <= self._gates[len(constraints) - 1]
                 (gated.accepted if is_accepted else gated.rejected).append(result)
-        return (after if gated.accepted else state), gated
+        return gated
 
     def _constraints(
         self, prior: Estimate, m: Measurement, scope: Scope, about: Linearization | None
@@ -59,4 +73,6 @@ class Gate:
         if about is not None:
             return about.constraints_of(prior, m, self._rules)
         constraints = constraints_of(prior.pose, m, scope, self._rules)
-        return curved(prior, m, constraints) if self._widens and not m.is_dependent else constraints
+        if constraints and self._widens and not m.is_dependent:
+            return curved(prior, m, constraints)
+        return constraints

@@ -31,14 +31,20 @@ class Linearization(NamedTuple):
     arc: Arc
     fit: ArcFit
 
+    @property
+    def pose(self) -> Pose2:
+        return self.arc.at(self.fit.offset)
+
     def constraints_of(
         self, prior: Estimate, m: Measurement, rules: LocalizerSettings
     ) -> list[Constraint]:
         """The constraints on an object with residuals about the mean of `prior`, which is about the
         tangent here; each as wide as its linear form is right."""
         offset = self.arc.tangent_offset(self.fit.offset)
-        constraints = constraints_of(self.arc.at(self.fit.offset), m, POSE, rules)
-        left_out = (0.0,) * len(constraints) if m.is_dependent else self._left_out(m, rules)
+        constraints = constraints_of(self.pose, m, POSE, rules)
+        if not constraints:
+            return []
+        left_out = [0.0] * len(constraints) if m.is_dependent else self._left_out(m, rules)
         found = []
         for c, square in zip(constraints, left_out, strict=True):
             predicted = dot(c.row, prior.covariance.times(c.row))
@@ -121,8 +127,9 @@ class Relinearization:
         accepted: list[Measure] = []
         for m in objects:
             measure = self._measure(state, m)
-            gate = self._gates[len(measure(arc.pose)) > 1]
-            if least_cost(arc, measure, gate) <= gate:
+            readings = len(measure(arc.pose))
+            gate = self._gates[readings > 1]
+            if readings and least_cost(arc, measure, gate) <= gate:
                 accepted.append(measure)
         fit = best_fit(arc, lambda pose: [s for measure in accepted for s in measure(pose)])
         return None if fit is None else (_about(state, arc, fit.offset), Linearization(arc, fit))

@@ -13,6 +13,7 @@ from support.nodes import estimate, exchange, helper, only_me, tier, two_robots
 
 from cpcbl_agents.node import Node, NodeCallbacks, NodeStart
 from cpcbl_agents.robot import build_robot
+from cpcbl_team.arcs import with_arc_width
 from cpcbl_team.config import LocalizerSettings
 from cpcbl_team.estimate import ZERO3
 from cpcbl_team.inputs import Sighting
@@ -36,7 +37,7 @@ def test_status_contains_quality_and_traffic() -> None:
     exchange(stand)
     mine, mates = stand.statuses().values()
     assert mine.tier == tier(stand, "me") > mates.tier == tier(stand, "mate")
-    assert mine.position_sigma_m == estimate(stand).position_sigma_m
+    assert mine.position_sigma_m == with_arc_width(estimate(stand)).position_sigma_m
     assert mine.lost == ""
     assert mates.messages_sent == mine.messages_received > 1
     assert mates.bytes_sent == mine.bytes_received

@@ -156,3 +156,12 @@ def test_an_object_is_judged_at_the_pose_that_fits_it_best() -> None:
     truth = arc.at((0.0, 0.0, 0.8))
     cost = least_cost(arc, lambda pose: sighted(truth, 12.0, 2.0, pose), 0.0)
     assert cost == pytest.approx(4.0, abs=0.05)
+
+
+def test_a_pose_is_not_its_own_rival() -> None:
+    """A turn to the left and one to the right by the rest of a circle."""
+    arc = Arc.of(Estimate(Pose2(0.0, 0.0, 0.0), diagonal(0.05, math.radians(70.0))))
+    truth = Pose2(0.0, 0.0, math.radians(170.0))
+    fit = best_fit(arc, lambda pose: sighted(truth, 3.0, 1.0, pose))
+    assert fit is not None
+    assert arc.at(fit.offset) == pytest.approx(truth, abs=0.05)

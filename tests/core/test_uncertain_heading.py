@@ -21,7 +21,7 @@ from cpcbl_launch.reporting.metrics import Samples, Score, score
 from cpcbl_team.config import Field, Gives, Landmark, OdometrySettings, SensorSettings, Start
 from cpcbl_team.gate import AMBIGUOUS
 from cpcbl_team.geometry import Pose2, step
-from cpcbl_team.inputs import Odometry, Sightings
+from cpcbl_team.inputs import Odometry, Sighting, Sightings
 from cpcbl_team.motion import motion_noise
 from cpcbl_team.state import State
 
@@ -116,3 +116,19 @@ def test_a_driver_that_is_wrong_is_rejected_and_moves_nothing() -> None:
     after = robot.cycle(state, behind)
     assert after.counts == {"gated": 1}
     assert after.estimate == state.estimate
+
+
+@pytest.mark.parametrize("place", [(1.0, 1.0), (2.0, 1.0), (1.0 + 1e-9, 1.0)])
+@pytest.mark.parametrize("reading", [(0.05, 0.0), (2.0, 1.0), (None, 0.3), (0.05, None)])
+def test_an_object_that_the_robot_touches_is_no_error(
+    place: tuple[float, float], reading: tuple[float | None, float | None]
+) -> None:
+    """Its direction means nothing where the estimate, or another pose of the arc, is."""
+    field = Field(landmarks={"post": Landmark(x_m=place[0], y_m=place[1])})
+    robot = localizer(field=field)
+    stands = state_at(Pose2(1.0, 1.0, 0.0), diagonal(0.05, math.radians(20.0)))
+    drove = robot.predict(robot.add_odometry(stands, Odometry(0, SECOND, 1.0, 0.0)), SECOND)
+    for state in (stands, drove):
+        seen = Sightings(state.stamp_ns, (Sighting("post", *reading),))
+        after = robot.cycle(state, seen)
+        assert all(map(math.isfinite, (*after.estimate.pose, *after.estimate.covariance)))
