@@ -14,11 +14,14 @@ from setuptools import Distribution
 from setuptools.command.build_ext import build_ext
 
 HOT = (
+    "arc_fit",
+    "arcs",
     "constant_errors",
     "constraints",
     "estimate",
     "fusion",
     "gaussian",
+    "gate",
     "geometry",
     "landmarks",
     "localizer",
@@ -32,6 +35,7 @@ HOT = (
     "range_errors",
     "recovery",
     "recovery_evidence",
+    "relinearization",
     "relocalization",
     "sensors",
     "state",

@@ -6,7 +6,7 @@ starts. Where another pose fits nearly as well there is no best one.
 """
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Final, NamedTuple
 
 from cpcbl_team.arcs import Arc
@@ -30,8 +30,8 @@ Measure = Callable[[Pose2], list[Scalar]]
 MOST_STEPS: Final = 12
 HALVINGS: Final = 6  # of a step that makes the fit worse
 LEAST_GAIN: Final = 1e-4  # of the chi-square, by a step
-STARTS: Final = (-2.0, -1.0, 1.0, 2.0)  # sigmas of the turn,
-SIDE_STARTS: Final = (-1.5, 1.5)  # and of the offset along each axis, besides the mean
+STARTS = (-2.0, -1.0, 1.0, 2.0)  # sigmas of the turn,
+SIDE_STARTS = (-1.5, 1.5)  # and of the offset along each axis, besides the mean
 SMALL_SHARE: Final = 1.0 / 16.0  # of the prior's determinant: much was uncertain
 LIKELY: Final = 2.0  # the chi-square a scalar of a fit beside which no other one is looked for
 APART: Final = 16.27  # the chi-square of another pose (99.9 %, three degrees of freedom)
@@ -65,17 +65,20 @@ def best_fit(arc: Arc, measure: Measure) -> ArcFit | None:
 def least_cost(arc: Arc, measure: Measure, enough: float) -> float:
     """The least chi-square of prior and measurements together, or one that is at most `enough`."""
     cost = _fit(arc, (0.0, 0.0, 0.0), measure).cost
-    starts = _other_starts(arc)
-    while cost > enough and (start := next(starts, None)) is not None:
+    for start in _other_starts(arc):
+        if cost <= enough:
+            break
         cost = min(cost, _fit(arc, start, measure).cost)
     return cost
 
 
-def _other_starts(arc: Arc) -> Iterator[Row]:
+def _other_starts(arc: Arc) -> list[Row]:
+    """Where fits begin, besides the mean."""
     xx, _, yy, _, _, hh = arc.covariance
-    yield from ((0.0, 0.0, k * math.sqrt(hh)) for k in STARTS)
-    yield from ((k * math.sqrt(xx), 0.0, 0.0) for k in SIDE_STARTS)
-    yield from ((0.0, k * math.sqrt(yy), 0.0) for k in SIDE_STARTS)
+    turn, x, y = math.sqrt(hh), math.sqrt(xx), math.sqrt(yy)
+    starts = [(0.0, 0.0, k * turn) for k in STARTS]
+    starts += [(k * x, 0.0, 0.0) for k in SIDE_STARTS]
+    return starts + [(0.0, k * y, 0.0) for k in SIDE_STARTS]
 
 
 def _fit(arc: Arc, offset: Row, measure: Measure) -> ArcFit:
