@@ -60,8 +60,7 @@ def considers_common_errors(settings: LocalizationSettings) -> bool:
     """Whether the filter may keep the errors that sightings have in common apart from those of each
     sighting. The variants that estimate heading and position apart do not, nor where sigmas are the
     paper's."""
-    rules = settings.localizer
-    return rules.variant == "joint" and not (rules.alternates or rules.paper_uncertainty)
+    return settings.localizer.estimates_whole_pose
 
 
 def considers_camera(settings: LocalizationSettings, camera: CameraSettings) -> bool:
@@ -88,7 +87,7 @@ def common_error_filter(
 
 def common_errors_of(state: State) -> CommonErrors:
     """What a robot that estimates errors beside its pose knows of them."""
-    common = state.memory.calibration.common
+    common = state.common_errors
     assert common is not None
     return common
 

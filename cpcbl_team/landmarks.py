@@ -116,6 +116,7 @@ class Landmarks:
         if plain:
             exact = {name: mark for name, mark in field.landmarks.items() if mark.is_exact}
             self._marks = {name: Mark(p.x_m, p.y_m, p.gives) for name, p in exact.items()}
+        self.names = frozenset(self._marks)
         self._uses_rays = rules.bearing_for_position
         self._gates = gates
         self._share_squared = s.range_share**2
@@ -130,17 +131,15 @@ class Landmarks:
         state: State,
         sightings: tuple[Sighting, ...],
         scope: Scope | None,
-        unusable: frozenset[str],
+        not_plain: frozenset[str],
         recorded: frozenset[str],
-        none_is_plain: bool = False,
     ) -> LandmarkUpdate:
-        """What the landmarks among `sightings` say about position or heading, or about both. One
-        of the `unusable` objects is not plain; one of `recorded` is no new evidence."""
+        """What the landmarks among `sightings` say about position or heading, or about both. An
+        object that is `not_plain` is left to the general way; one of `recorded` is no new
+        evidence."""
         update, marks = LandmarkUpdate(state), self._marks
-        if none_is_plain:
-            marks = {}
-        elif unusable:
-            marks = {name: mark for name, mark in marks.items() if name not in unusable}
+        if not_plain:
+            marks = {name: mark for name, mark in marks.items() if name not in not_plain}
         uses_range = scope is not None and scope is not HEADING
         uses_bearing = scope is not None and (scope is not POSITION or self._uses_rays)
         for sighting in sightings:

@@ -153,11 +153,9 @@ class Localizer:
         recovery = state.memory.recovery
         recorded = recently_recorded(recovery, stamp_ns)
         unusable = self._timers.unusable(state, now)
-        is_bent = self._relinearization.is_due(state)
+        not_plain = self._landmarks.names if self._relinearization.is_due(state) else unusable
         for scope in self._update_order(state):
-            landmarks = self._landmarks.update(
-                state, frame.sightings, scope, unusable, recorded, is_bent
-            )
+            landmarks = self._landmarks.update(state, frame.sightings, scope, not_plain, recorded)
             measured: list[Measurement] = []
             faults: list[str] = []
             if landmarks.others:

@@ -13,7 +13,7 @@ from cpcbl_team.arc_fit import ArcFit, Measure, Scalar, best_fit, least_cost
 from cpcbl_team.arcs import Arc, square_root
 from cpcbl_team.common_error_filter import CommonErrorFilter
 from cpcbl_team.config import LocalizationSettings, LocalizerSettings
-from cpcbl_team.constraints import Constraint, curved_variance
+from cpcbl_team.constraints import TELLS_NOTHING, Constraint, curved_variance
 from cpcbl_team.estimate import POSE, ZERO3, Estimate, Row, dot
 from cpcbl_team.geometry import Pose2, wrap_angle
 from cpcbl_team.measurements import Measurement, constraints_of
@@ -33,6 +33,7 @@ class Linearization(NamedTuple):
 
     @property
     def pose(self) -> Pose2:
+        """The pose itself (field_from_robot)."""
         return self.arc.at(self.fit.offset)
 
     def constraints_of(
@@ -44,7 +45,9 @@ class Linearization(NamedTuple):
         constraints = constraints_of(self.pose, m, POSE, rules)
         if not constraints:
             return []
-        left_out = [0.0] * len(constraints) if m.is_dependent else self._left_out(m, rules)
+        left_out = [0.0] * len(constraints)
+        if not m.is_dependent:
+            left_out = self._left_out(constraints, m, rules)
         found = []
         for c, square in zip(constraints, left_out, strict=True):
             predicted = dot(c.row, prior.covariance.times(c.row))
@@ -52,13 +55,15 @@ class Linearization(NamedTuple):
             found.append(c._replace(residual=c.residual + dot(c.row, offset), sigma=sigma))
         return found
 
-    def _left_out(self, m: Measurement, rules: LocalizerSettings) -> list[float]:
+    def _left_out(
+        self, here: list[Constraint], m: Measurement, rules: LocalizerSettings
+    ) -> list[float]:
         """The mean square of what each linear constraint leaves out where the pose may be after all
         measurements: E[(e^T M e / 2)^2] = (tr(M)^2 + 2 |M|^2) / 4 of a normal e, with second
         differences M along the columns of a square root of the covariance."""
         a, b, c = square_root(self.fit.covariance)
         pairs = _sum(a, b), _sum(a, c), _sum(b, c)
-        along = [self._second_differences(direction, m, rules) for direction in (a, b, c, *pairs)]
+        along = [self._second_differences(here, by, m, rules) for by in (a, b, c, *pairs)]
         squares = []
         for aa, bb, cc, ab, ac, bc in zip(*along, strict=True):
             mixed = ((ab - aa - bb) ** 2 + (ac - aa - cc) ** 2 + (bc - bb - cc) ** 2) / 4.0
@@ -66,15 +71,16 @@ class Linearization(NamedTuple):
             squares.append(0.25 * ((aa + bb + cc) ** 2 + 2.0 * norm))
         return squares
 
-    def _second_differences(self, by: Row, m: Measurement, rules: LocalizerSettings) -> list[float]:
-        """Of the residual of each constraint, in its unit, when the offset moves by this."""
+    def _second_differences(
+        self, here: list[Constraint], by: Row, m: Measurement, rules: LocalizerSettings
+    ) -> list[float]:
+        """Of the residual of each constraint, in its unit, when the offset moves by this. A pose
+        that touches the object has none, and so these tell nothing."""
         x, y, turn = self.fit.offset
-        before, here, after = (
-            constraints_of(
-                self.arc.at((x + k * by[0], y + k * by[1], turn + k * by[2])), m, POSE, rules
-            )
-            for k in (-1.0, 0.0, 1.0)
-        )
+        offsets = [(x + k * by[0], y + k * by[1], turn + k * by[2]) for k in (-1.0, 1.0)]
+        before, after = (constraints_of(self.arc.at(offset), m, POSE, rules) for offset in offsets)
+        if not len(before) == len(here) == len(after):
+            return [TELLS_NOTHING] * len(here)
         return [_second_difference(*beside) for beside in zip(before, here, after, strict=True)]
 
 
@@ -100,17 +106,14 @@ class Relinearization:
         """`gates`: chi-square bounds of one and of two constraints. `common`: the errors that
         depend on those of the pose."""
         self._rules, self._gates, self._common = settings.localizer, gates, common
-        rules = settings.localizer
-        self._is_used = rules.variant == "joint" and not (
-            rules.alternates or rules.paper_uncertainty
-        )
 
     def is_due(self, state: State) -> bool:
         """Whether the estimate is a Gaussian along an arc only. (That of a robot that rejects what
         it measures is a doubt, and no arc.)"""
         memory = state.memory.recovery
         is_doubt = memory.suspected_ns >= 0 or memory.kidnapped_ns >= 0
-        return self._is_used and state.estimate.covariance.hh > BENT_VARIANCE and not is_doubt
+        is_bent = self._rules.estimates_whole_pose and state.estimate.covariance.hh > BENT_VARIANCE
+        return is_bent and not is_doubt
 
     def about_best_pose(
         self, state: State, measurements: Iterable[Measurement]
@@ -118,11 +121,10 @@ class Relinearization:
         """The state with its prior about the pose that fits the objects of the map best, and that
         pose; None if another pose fits nearly as well. The state as it is, and no pose, where its
         estimate is no arc, or these objects leave none."""
-        objects = [m for m in measurements if not m.sender]
-        if not objects or not self.is_due(state):
+        if not self.is_due(state):
             return state, None
-        arc = Arc.of(state.estimate)
-        if not all(_leaves_arc(arc, m) for m in objects):
+        arc, objects = Arc.of(state.estimate), [m for m in measurements if not m.sender]
+        if not objects or not all(_leaves_arc(arc, m) for m in objects):
             return state, None
         accepted: list[Measure] = []
         for m in objects:

@@ -57,3 +57,8 @@ class LocalizerSettings(Table, frozen=True, kw_only=True):
     def alternates(self) -> bool:
         """Whether heading and position are updated in separate cycles."""
         return self.variant != "joint" if self.alternate is None else self.alternate
+
+    @property
+    def estimates_whole_pose(self) -> bool:
+        """Whether heading and position are one estimate, with the uncertainty of both."""
+        return self.variant == "joint" and not (self.alternates or self.paper_uncertainty)

@@ -48,15 +48,21 @@ def test_a_router_remembers_who_has_moved() -> None:
         check(*(stack.enter_context(open_bus("lab", [endpoint])) for _ in range(3)))
 
 
+def beside_a_robot_that_moved(stack: ExitStack, endpoint: str) -> tuple[ZenohBus, ZenohBus]:
+    """A router, and the session of a robot that told it that it has moved."""
+    router = open_router("lab", [endpoint])
+    repeat_tokens(router)
+    robot = stack.enter_context(open_bus("lab", [endpoint]))
+    OwnTokens(robot, "r1", "1").declare_moved()
+    return router, robot
+
+
 def test_a_router_that_is_started_again_learns_it_from_a_later_process_that_stands() -> None:
     """The second process of a robot knew that it had moved, and told nobody: killed beside the
     next router, its third one was certain of a start that the robot had left long ago."""
     with ExitStack() as stack:
         endpoint = free_endpoint()
-        router = open_router("lab", [endpoint])
-        repeat_tokens(router)
-        first = stack.enter_context(open_bus("lab", [endpoint]))
-        OwnTokens(first, "r1", "1").declare_moved()
+        router, first = beside_a_robot_that_moved(stack, endpoint)
         second = stack.enter_context(open_bus("lab", [endpoint]))
         wait_until(lambda: len(second.tokens(topics.RAN.at(robot="r1"))) == 4)
         first.close()
@@ -73,10 +79,7 @@ def test_a_router_that_is_started_again_does_not_know_who_was_killed_before_it()
     """What nobody is left to tell it: docs/deployment.md says what to do."""
     with ExitStack() as stack:
         endpoint = free_endpoint()
-        router = open_router("lab", [endpoint])
-        repeat_tokens(router)
-        first = stack.enter_context(open_bus("lab", [endpoint]))
-        OwnTokens(first, "r1", "1").declare_moved()
+        router, first = beside_a_robot_that_moved(stack, endpoint)
         first.close()
         router.close()
         repeat_tokens(stack.enter_context(open_router("lab", [endpoint])))

@@ -18,11 +18,17 @@ from support.core import (
 from support.sweeps import over_seeds
 
 from cpcbl_launch.reporting.metrics import Samples, Score, score
+from cpcbl_team.arc_fit import ArcFit
+from cpcbl_team.arcs import Arc, square_root
 from cpcbl_team.config import Field, Gives, Landmark, OdometrySettings, SensorSettings, Start
+from cpcbl_team.constraints import TELLS_NOTHING
+from cpcbl_team.estimate import Estimate
 from cpcbl_team.gate import AMBIGUOUS
 from cpcbl_team.geometry import Pose2, step
 from cpcbl_team.inputs import Odometry, Sighting, Sightings
+from cpcbl_team.measurements import measurement_of
 from cpcbl_team.motion import motion_noise
+from cpcbl_team.relinearization import Linearization
 from cpcbl_team.state import State
 
 ODOMETRY, SENSOR = OdometrySettings(), SensorSettings()
@@ -132,3 +138,17 @@ def test_an_object_that_the_robot_touches_is_no_error(
         seen = Sightings(state.stamp_ns, (Sighting("post", *reading),))
         after = robot.cycle(state, seen)
         assert all(map(math.isfinite, (*after.estimate.pose, *after.estimate.covariance)))
+
+
+def test_a_constraint_whose_bend_cannot_be_told_tells_nothing() -> None:
+    """One sigma to the side the robot would touch the post, where there is no bearing."""
+    estimate = Estimate(Pose2(0.0, 0.0, 0.0), diagonal(0.5, math.radians(20.0)))
+    arc = Arc.of(estimate)
+    beside, _, _ = square_root(arc.covariance)
+    robot = localizer(field=Field(landmarks={"post": Landmark(x_m=beside[0], y_m=0.0)}))
+    seen = Sighting("post", 0.5, 0.0)
+    m = measurement_of(seen, 0, estimate.pose, robot.field, {}, robot.settings)
+    assert m is not None
+    about = Linearization(arc, ArcFit((0.0, 0.0, 0.0), 0.0, (0.0, 0.0, 0.0), arc.covariance, 2))
+    found = about.constraints_of(estimate, m, robot.settings.localizer)
+    assert [c.sigma for c in found] == [math.sqrt(TELLS_NOTHING)] * 2
