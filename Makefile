@@ -37,7 +37,7 @@ quick: setup
 check: setup
 	$(BIN)/ruff format --check
 	$(BIN)/ruff check
-	$(BIN)/mypy --num-workers 2
+	$(BIN)/mypy
 	PYTHONPATH=.:agents:transport:launch $(BIN)/lint-imports --no-cache
 
 # More workers than cores: many tests wait for the processes that they started.

@@ -76,19 +76,38 @@ class Robot:
         frames = robot_frames(name, team, start_ns, order)
         if begins_frame(team, name):
             settings = replace(settings, start=ORIGIN)
-        known = settings, team.map_of(name), teammates, start_ns
-        self.filter = FilterAgent(*known, camera, name, shared, frames)
+        self.filter = FilterAgent(
+            settings,
+            team.map_of(name),
+            teammates,
+            start_ns,
+            camera=camera,
+            robot=name,
+            shared=shared,
+            frames=frames,
+        )
         self._is_weighted = settings.localizer.variant == "weighted"  # it has no covariance
         self._sightings_input = "frame" if settings.sensing == "camera" else "sightings"
-        match = team.messages_per_s(name), restarted, team.match.duration_s
-        budget = Budget(settings.collaboration.budget, start_ns, *match)
-        names = team.map.names | frozenset(team.robots)
-        guests = GuestRegistry(names, team.guests.most if team.guests.allowed else 0)
-        sharing = LandmarkSharing(name, shared, len(team.robots))
-        mates = TeammateFrames(name, teammates, order)
-        mates.begin_frame(self.filter.frame)
-        agent = name, settings, teammates, start_ns, budget, guests, sharing, mates
-        self.collaboration = CollaborationAgent(*agent)
+        self.collaboration = CollaborationAgent(
+            name,
+            settings,
+            teammates,
+            start_ns,
+            budget=Budget(
+                settings.collaboration.budget,
+                start_ns,
+                match_rate_hz=team.messages_per_s(name),
+                restarted=restarted,
+                match_s=team.match.duration_s,
+            ),
+            guests=GuestRegistry(
+                team.map.names | frozenset(team.robots),
+                team.guests.most if team.guests.allowed else 0,
+            ),
+            landmarks=LandmarkSharing(name, shared, len(team.robots)),
+            frames=TeammateFrames(name, teammates, order),
+        )
+        self.collaboration.frames.begin_frame(self.filter.frame)
         self._teammates = teammates
 
     def handle(
@@ -146,10 +165,11 @@ class Robot:
         for reason, number in self.sensing.refused.items():
             refused["sightings" if reason == "seen_twice" else "frame", reason] += number
         is_camera_lost = camera["camera_lost"] > camera["camera_back"]
-        known, recovery = state.memory.calibration, state.memory.recovery
-        pose = state.estimate, recovery.lost, known
+        recovery = state.memory.recovery
         return InputSnapshot(
-            *pose,
+            state.estimate,
+            recovery.lost,
+            state.memory.calibration,
             refused,
             is_camera_lost,
             mistake=recovery.mistake,
@@ -165,8 +185,16 @@ class Robot:
         state = self.filter.timeline.latest(now_ns)
         (x_m, y_m, heading_rad), (xx, xy, yy, xh, yh, hh), _ = state.reported
         rows = None if self._is_weighted else ((xx, xy, xh), (xy, yy, yh), (xh, yh, hh))
-        where = self.name, state.stamp_ns, x_m, y_m, heading_rad, rows, state.lost
-        return Pose(*where, frame=self.filter.frame)
+        return Pose(
+            self.name,
+            state.stamp_ns,
+            x_m,
+            y_m,
+            heading_rad,
+            covariance=rows,
+            lost=state.lost,
+            frame=self.filter.frame,
+        )
 
     @property
     def next_ns(self) -> int:

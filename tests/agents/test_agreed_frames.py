@@ -63,7 +63,7 @@ def test_by_landmarks_and_each_other_they_are_soon_in_the_best_frame(seeds: rang
 @over_seeds(2, 16)
 def test_without_any_landmark_they_find_each_other(seeds: range) -> None:
     """With 16 seeds of 60 s the NEES was 1.5 on average; after 25 s at most all were in one."""
-    worlds = [World(bare(), seed).run(20.0) for seed in seeds]
+    worlds = [World(bare(), seed).run(30.0) for seed in seeds]
     assert all(set(world.frames.values()) == {PIONEERS} for world in worlds)
     assert_right(*worlds)
 

@@ -5,7 +5,10 @@ from typing import Any, TypeVar
 
 from cpcbl_agents.agent import BeliefSubscribers, FrameEstimate, HelpSent, PoseEstimate, Presence
 from cpcbl_agents.collaboration import CollaborationAgent
+from cpcbl_agents.guests import GuestRegistry
+from cpcbl_agents.landmark_sharing import LandmarkSharing
 from cpcbl_agents.message_counters import MessageCounter
+from cpcbl_agents.teammate_frames import TeammateFrames
 from cpcbl_team.config import (
     BudgetSettings,
     CollaborationSettings,
@@ -16,6 +19,7 @@ from cpcbl_team.config import (
     Variant,
 )
 from cpcbl_team.estimate import Estimate
+from cpcbl_team.frames import FrameOrder
 from cpcbl_team.geometry import Pose2
 from cpcbl_team.inputs import Belief, Fix, Sighting, Sightings
 from cpcbl_transport.budget import Budget
@@ -50,7 +54,16 @@ class Alone:
             odometry=OdometrySettings(moves=moves),
             collaboration=CollaborationSettings(budget=budget, **rules),
         )
-        self.agent = CollaborationAgent("me", settings, MATES, 0, Budget(budget, 0))
+        self.agent = CollaborationAgent(
+            "me",
+            settings,
+            MATES,
+            0,
+            budget=Budget(budget, 0),
+            guests=GuestRegistry(known=()),
+            landmarks=LandmarkSharing("me", names=frozenset(), robots=1 + len(MATES)),
+            frames=TeammateFrames("me", MATES, FrameOrder({})),
+        )
         self.now_ns = 0
         self.heard = True
         self.early: list[Fix] = []  # fixes that waited for something
