@@ -25,6 +25,7 @@ HOT = (
     "geometry",
     "landmarks",
     "localizer",
+    "lost_reasons",
     "map_rejections",
     "map_residuals",
     "miscalibration",

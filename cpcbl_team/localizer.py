@@ -27,6 +27,7 @@ from cpcbl_team.inputs import (
 )
 from cpcbl_team.landmark_beliefs import LandmarkBeliefs
 from cpcbl_team.landmarks import Landmarks, LandmarkUpdate
+from cpcbl_team.lost_reasons import with_innovations
 from cpcbl_team.measurements import (
     BELIEF_VALID_BEFORE_NS,
     GatedObjects,
@@ -38,7 +39,7 @@ from cpcbl_team.mended_inputs import with_mended_inputs
 from cpcbl_team.object_timers import ObjectTimers, has_passed
 from cpcbl_team.own_calibration import OwnCalibration
 from cpcbl_team.prediction import Prediction
-from cpcbl_team.recovery import Recovery, with_innovations
+from cpcbl_team.recovery import Recovery
 from cpcbl_team.recovery_evidence import (
     evidence_from_observation,
     is_in_quarantine,

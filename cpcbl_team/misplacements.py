@@ -3,7 +3,7 @@
 from typing import Final
 
 from cpcbl_team.map_residuals import NO_OFFSET
-from cpcbl_team.state import CalibrationMemory
+from cpcbl_team.state import Memory
 
 MISPLACED: Final = "misplaced_"
 """The count of such an object begins with this: how far it is from its place (mm), 1: not known."""
@@ -11,9 +11,10 @@ REJECTED: Final = "rejected_"  # how often it was rejected of late
 MOVES: Final = "moves_"  # how often it has moved, of one that the robot has found itself
 
 
-def misplacements(calibration: CalibrationMemory, stamp_ns: int) -> dict[str, int]:
+def misplacements(memory: Memory, stamp_ns: int) -> dict[str, int]:
     """The counts of all such objects."""
-    counts: dict[str, int] = {}
+    unused, calibration = memory.recovery.unused_objects(stamp_ns), memory.calibration
+    counts = {MISPLACED + name: 1 for name in sorted(unused)}
     if name := calibration.misplaced(stamp_ns):
         offset = calibration.residuals.of_object.get(name, NO_OFFSET)
         rejected = round(calibration.rejections.of_object.get(name, 0.0))

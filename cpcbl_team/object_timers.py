@@ -34,10 +34,13 @@ class ObjectTimers:
 
     def unusable(self, state: State, now_ns: int) -> frozenset[str]:
         """The objects of which a frame of the time `now_ns` may not be used: those used too short a
-        time ago, and one that stands elsewhere than on the map although the gates accept it. (What
-        they reject shows that the robot is lost, where it is.)"""
+        time ago, and those that stand elsewhere than on the map: one that the gates accept
+        (`map_residuals.py`), and what they reject of a robot that is not lost
+        (`contradictions.py`)."""
         updates, misplaced = state.updates, state.memory.calibration.residuals.misplaced
         names = frozenset((misplaced,)) if misplaced else _NOBODY
+        if state.memory.recovery.misplaced:
+            names |= state.memory.recovery.unused_objects(now_ns)
         if self._interval_ns == 0.0 and now_ns >= state.stamp_ns:
             return names
         return names.union(

@@ -5,16 +5,17 @@ It then looks for its pose in recent evidence (`relocalization.py`); while that 
 what it measures, it inflates its covariance step by step until its gates open.
 """
 
-import math
-from collections.abc import Callable, Mapping, Sequence
-from typing import Final, NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Final
 
-from cpcbl_team.config import Field, LocalizationSettings, LocalizerSettings
+from cpcbl_team.config import Field, LocalizationSettings
+from cpcbl_team.contradictions import kept_at_trusted_pose
 from cpcbl_team.estimate import Estimate
 from cpcbl_team.inflation import inflate_covariance, inflate_to
 from cpcbl_team.initial_pose import estimate_of
 from cpcbl_team.inputs import InitialPose
 from cpcbl_team.landmarks import Landmarks
+from cpcbl_team.lost_reasons import Limits, lost_reason, rejected_of, undetermined
 from cpcbl_team.map_rejections import MapRejections
 from cpcbl_team.map_residuals import NO_RESIDUALS
 from cpcbl_team.miscalibration import (
@@ -23,7 +24,7 @@ from cpcbl_team.miscalibration import (
     noise_with_factor,
 )
 from cpcbl_team.recovery_evidence import WINDOW_NS, latest
-from cpcbl_team.relocalization import UNKNOWNS, are_apart, readings_of, relocalize
+from cpcbl_team.relocalization import are_apart, relocalize
 from cpcbl_team.sender_comparisons import SenderRecords, contest_m
 from cpcbl_team.sensor_mistakes import (
     MIRRORED,
@@ -54,87 +55,6 @@ DOUBT_NS: Final = 5_000_000_000  # wrong inputs are named before they move a rob
 QUESTION_NS: Final = 2_000_000_000  # a suspicious robot asks so often whether it is elsewhere
 SUSPICIOUS: Final = 2  # of the last innovations rejected; of 20 that is 2 in 10 000 times
 UNCONFIRMED: Final = 3  # of them, for a robot to which nothing can tell that it is where it was
-
-
-# Being lost ---------------------------------------------------------------------------------------
-
-
-def with_innovations(window: int, accepted: int, rejected: int, length: int) -> int:
-    """The window of innovations after these more: the last `length`, the latest in the lowest bit.
-    A bit each, set for an accepted one, after a leading bit that is always set: 1 is empty."""
-    window = ((window + 1 << accepted) - 1) << rejected
-    full = 1 << length
-    return window if window < full else full | window & full - 1
-
-
-class Limits(NamedTuple):
-    """Beyond one of these a robot is lost."""
-
-    position_variance: float  # m^2, the mean of both axes
-    heading_variance: float  # rad^2
-    innovations: int  # the window has at least so many,
-    rejected: float  # of which more than so many were rejected
-
-    @staticmethod
-    def of(settings: LocalizerSettings, slack: float = 1.0) -> "Limits":
-        """`slack`: the share of each limit that counts."""
-        return Limits(
-            (slack * settings.lost_position_sigma_m) ** 2,
-            math.radians(slack * settings.lost_heading_sigma_deg) ** 2,
-            settings.lost_window // 2,
-            slack * settings.lost_share * settings.lost_window,
-        )
-
-
-def lost_reason(estimate: Estimate, innovations: int, limits: Limits) -> str:
-    """Why the robot is lost; empty if it is not."""
-    position_variance, heading_variance, least, most = limits
-    xx, _, yy, _, _, hh = estimate.covariance
-    if 0.5 * (xx + yy) > position_variance:
-        return f"position sigma {estimate.position_sigma_m:.2f} m"
-    if hh > heading_variance:
-        return f"heading sigma {math.degrees(estimate.heading_sigma_rad):.0f} deg"
-    rejected, length = rejected_of(innovations)
-    if rejected > most and length >= least:
-        return f"{rejected} of the last {length} innovations rejected"
-    return ""
-
-
-def undetermined(
-    evidence: Sequence[Evidence], objects_ns: Mapping[str, int], kidnapped_ns: int
-) -> str:
-    """Why a robot that may have been kidnapped does not know its pose, though its gates accept what
-    it measures now; empty if it does, and without evidence (walls are none).
-
-    `objects_ns`: when each object was last accepted. A pose has three unknowns, so fewer than three
-    readings of different objects determine none, and without a bearing no readings determine a
-    heading. (Along the way they may: see `relocalize`.)
-    """
-    if not evidence:
-        return ""
-    since = [e for e in evidence if e.stamp_ns > kidnapped_ns]
-    accepted = [e for e in since if objects_ns.get(e.source, kidnapped_ns) > kidnapped_ns]
-    if any(e.heading_rad is not None for e in accepted):
-        return ""
-    readings = {e.source: readings_of(e) for e in accepted}
-    names = sorted(readings)
-    if len(names) < 2:
-        return (
-            f"only {names[0] if names else 'one object'} agrees: no turn about it can be observed"
-        )
-    if sum(readings.values()) < UNKNOWNS:
-        return f"only {' and '.join(names)} agree: two readings do not determine a pose"
-    if all(e.bearing_rad is None for e in accepted):
-        return "only ranges or positions agree: they do not determine a heading"
-    return ""
-
-
-def rejected_of(innovations: int) -> tuple[int, int]:
-    """How many innovations of a window were rejected, and how many it has."""
-    if innovations & innovations + 1 == 0:  # all bits are set: none was rejected
-        return 0, innovations.bit_length() - 1
-    digits = innovations.bit_length()
-    return digits - innovations.bit_count(), digits - 1
 
 
 class Recovery:
@@ -198,6 +118,8 @@ class Recovery:
         own = tuple(e for e in evidence if not e.from_teammate)  # a liar must not move it
         memory = memory._replace(relocalization_ns=now)
         found = self._relocalized(state, own)
+        if (kept := self._kept_at_trusted_pose(state, memory, found)) is not None:
+            return kept
         record = state.memory.calibration.stationary
         stands = record is not None and record.checkpoints[0].stamp_ns <= memory.suspected_ns
         if found is None or agrees(state.estimate, found, stands):
@@ -245,6 +167,8 @@ class Recovery:
         if evidence and evidence[-1].stamp_ns > memory.relocalization_ns:
             memory = memory._replace(relocalization_ns=evidence[-1].stamp_ns)
             found = self._relocalized(state, evidence)
+            if (kept := self._kept_at_trusted_pose(state, memory, found)) is not None:
+                return kept
             if mistake := self._explaining_mistake(state, memory, found, evidence):
                 return self._at_trusted_pose(state, memory, mistake)
             if found is not None:
@@ -264,6 +188,8 @@ class Recovery:
         """The state of a robot that is no longer lost, because it accepts what it measures; unless
         a mistake explains that as well."""
         memory = state.memory.recovery
+        if (kept := self._kept_at_trusted_pose(state, memory, state.estimate)) is not None:
+            return kept
         evidence = self._evidence_since(state, max(memory.kidnapped_ns, memory.suspected_ns))
         if mistake := self._explaining_mistake(state, memory, state.estimate, evidence):
             return self._at_trusted_pose(state, memory, mistake)
@@ -330,8 +256,14 @@ class Recovery:
         """All the evidence in a memory, the latest last: of landmarks as the robot would measure
         them with this adaptation."""
         of_landmarks = self._landmarks.evidence_of
-        pieces = [piece for s in memory.snapshots for piece in of_landmarks(s, adaptation)]
-        return latest(tuple(sorted((*pieces, *memory.evidence), key=_stamp)))
+        pieces: Sequence[Evidence] = [
+            piece for s in memory.snapshots for piece in of_landmarks(s, adaptation)
+        ]
+        pieces = sorted((*pieces, *memory.evidence), key=_stamp)
+        if memory.misplaced:
+            unused = memory.unused_objects(pieces[-1].stamp_ns) if pieces else frozenset()
+            pieces = [e for e in pieces if e.source not in unused]
+        return latest(tuple(pieces))
 
     def _evidence_since(self, state: State, stamp_ns: int) -> tuple[Evidence, ...]:
         memory = state.memory
@@ -369,6 +301,22 @@ class Recovery:
         # What was accepted at another pose says nothing of this one.
         rejected = 1 << self._settings.lost_window
         return kept._replace(updates=kept.updates._replace(innovations=rejected))
+
+    def _kept_at_trusted_pose(
+        self, state: State, memory: RecoveryMemory, found: Estimate | None
+    ) -> State | None:
+        """The state of a robot that is where odometry led it from its trusted pose, whatever it
+        rejects; None if it may be elsewhere, as where it was `found`."""
+        evidence = self._evidence_since(state, memory.suspected_ns)
+        explained = kept_at_trusted_pose(state, memory, evidence, self._field.landmarks, found)
+        if explained is None:
+            return None
+        recovery, estimate = explained
+        if estimate is None:
+            updates = state.updates._replace(innovations=1)
+            return with_recovery(state, recovery)._replace(updates=updates)
+        senders = state.memory.teammates.senders
+        return self._begun_anew(state.counted("found_again"), estimate, recovery, senders)
 
     def _relocalized(self, state: State, evidence: tuple[Evidence, ...]) -> Estimate | None:
         """The pose that evidence determines, by odometry as noisy as the robot found it to be."""

@@ -142,6 +142,12 @@ class RecoveryMemory(NamedTuple):
     trusted: TrustedPose | None = None  # from before that, while it does
     mistake: str = ""  # of its driver, that explains what it rejects; it does not move meanwhile
     jump: Jump | None = None  # the latest
+    misplaced: Mapping[str, int] = _NONE
+    """Objects that contradicted a robot that was where it was, and until when each is not used."""
+
+    def unused_objects(self, now_ns: int) -> frozenset[str]:
+        """Those of `misplaced` that are not used now."""
+        return frozenset(n for n, until_ns in self.misplaced.items() if until_ns > now_ns)
 
 
 class TeammateMemory(NamedTuple):
@@ -384,13 +390,8 @@ def with_records(
     until_ns: int,
 ) -> RecoveryMemory:
     """The recovery's memory with other evidence, and the sources of which no more is needed."""
-    lost, inflated_ns, relocated_ns, _, _, _, _, kidnapped_ns, suspected_ns, pose, mistake, jump = (
-        recovery
-    )
-    parts = (
-        lost, inflated_ns, relocated_ns, snapshots, evidence, recorded, until_ns,
-        kidnapped_ns, suspected_ns, pose, mistake, jump,
-    )  # fmt: skip
+    lost, inflated_ns, relocated_ns, _, _, _, _, *others = recovery
+    parts = lost, inflated_ns, relocated_ns, snapshots, evidence, recorded, until_ns, *others
     return new(RecoveryMemory, parts)
 
 

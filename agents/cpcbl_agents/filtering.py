@@ -95,9 +95,8 @@ class FilterAgent:
         """What this agent refused, what the localizer used and gated, and what it finds wrong in
         the settings and the map."""
         state = self.timeline.state
-        calibration = state.memory.calibration
-        factors = percentages(calibration.adaptation)
-        factors |= misplacements(calibration, state.stamp_ns)
+        factors = percentages(state.memory.calibration.adaptation)
+        factors |= misplacements(state.memory, state.stamp_ns)
         return self.counts + Counter(self.timeline.state.counts) + Counter(factors)
 
     @property

@@ -27,7 +27,7 @@ from cpcbl_team.config import Team
 from cpcbl_team.estimate import Estimate
 from cpcbl_team.frames import FIELD, ORIGIN, FrameOrder, begins_frame, frame_name, knows_map
 from cpcbl_team.inputs import BeliefShared, InitialPose, InputsMended, SightingFault
-from cpcbl_team.recovery import rejected_of
+from cpcbl_team.lost_reasons import rejected_of
 from cpcbl_team.state import CalibrationMemory, Jump, pose_of
 from cpcbl_team.trust import TrustStatus
 from cpcbl_transport.budget import Budget

@@ -16,7 +16,7 @@ from cpcbl_team.config import Field, Gives, Landmark, OdometrySettings, SensorSe
 from cpcbl_team.estimate import Estimate
 from cpcbl_team.geometry import Pose2, step, wrap_angle
 from cpcbl_team.inputs import Odometry
-from cpcbl_team.recovery import with_innovations
+from cpcbl_team.lost_reasons import with_innovations
 from cpcbl_team.recovery_evidence import MOST_PIECES, SPACING_NS
 from cpcbl_team.relocalization import relocalize
 from cpcbl_team.state import Evidence, Memory, RecoveryMemory, State, Updates

@@ -85,7 +85,7 @@ def test_a_landmark_that_was_pushed_is_named_and_found_anew() -> None:
     said: list[dict[str, int]] = []
 
     def watch(state: State) -> None:
-        said.append(misplacements(state.memory.calibration, state.stamp_ns))
+        said.append(misplacements(state.memory, state.stamp_ns))
 
     state, pose, worst = driven_among(robot, state, pose, lambda _: pushed(0.6, 0.8), watch)
     assert worst < 0.1
@@ -109,7 +109,7 @@ def test_one_that_moves_again_and_again_is_not_looked_for_any_more() -> None:
     for _ in range(2):
         state, pose, worst = driven_among(robot, state, pose, field)
         assert worst < 0.1
-    counts = misplacements(state.memory.calibration, state.stamp_ns)
+    counts = misplacements(state.memory, state.stamp_ns)
     assert counts["moves_ne"] == MOST_MOVES
     assert "ne" not in state.common_errors.objects  # type: ignore[union-attr]
     assert set(state.common_errors.objects) == {"nw", "sw", "se"}  # type: ignore[union-attr]

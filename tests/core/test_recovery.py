@@ -43,11 +43,11 @@ from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.geometry import Pose2, wrap_angle
 from cpcbl_team.inflation import inflate_covariance
 from cpcbl_team.inputs import Sighting, Sightings
+from cpcbl_team.lost_reasons import Limits, lost_reason, with_innovations
 from cpcbl_team.measurements import Measurement
 from cpcbl_team.miscalibration import Adaptation, noise_with_factor
 from cpcbl_team.places import ObjectPosition
 from cpcbl_team.range_errors import RangeErrors
-from cpcbl_team.recovery import Limits, lost_reason, with_innovations
 from cpcbl_team.recovery_evidence import (
     MOST_PIECES,
     SPACING_NS,
