@@ -24,7 +24,7 @@ READINGS: Final = 2  # that must agree for each object that contradicts
 UNUSED_NS: Final = 120_000_000_000  # for so long such an object is not used; then it is tried again
 
 
-class _Verdict(NamedTuple):
+class _Agreement(NamedTuple):
     """What the pieces of evidence of one object say of a pose."""
 
     pieces: Sequence[Evidence]  # the latest, that all agree or all contradict
@@ -53,9 +53,9 @@ def misplaced_objects(
         return _chi_square(known, e, odometry_from_robot)
 
     own = [e for e in evidence if not e.from_teammate and e.source in names]
-    verdicts = _verdicts(own, chi_square)
-    wrong = {name: v for name, v in verdicts.items() if v.contradicts}
-    right = [v.pieces[-1] for v in verdicts.values() if not v.contradicts]
+    agreements = _agreements(own, chi_square)
+    wrong = {name: v for name, v in agreements.items() if v.contradicts}
+    right = [v.pieces[-1] for v in agreements.values() if not v.contradicts]
     found = {
         name
         for name, v in wrong.items()
@@ -87,9 +87,9 @@ def _chi_square(known: Estimate, e: Evidence, odometry_from_robot: Pose2) -> flo
     return FilteredOffset(known.covariance).after(rows).cost
 
 
-def _verdicts(
+def _agreements(
     evidence: Sequence[Evidence], chi_square: Callable[[Evidence], float]
-) -> Mapping[str, _Verdict]:
+) -> Mapping[str, _Agreement]:
     """By object. One whose latest piece neither agrees nor contradicts says nothing."""
     found = {}
     by_object = sorted(evidence, key=lambda e: e.source)  # stable: each in order of time
@@ -97,7 +97,7 @@ def _verdicts(
         judged = [(e, chi_square(e)) for e in pieces][::-1]
         latest = judged[0][1]
         if latest >= OUTLIER or latest < AGREEMENT:
-            found[name] = _Verdict(_alike(judged), contradicts=latest >= OUTLIER)
+            found[name] = _Agreement(_alike(judged), contradicts=latest >= OUTLIER)
     return found
 
 
@@ -109,7 +109,7 @@ def _alike(judged: Sequence[tuple[Evidence, float]]) -> Sequence[Evidence]:
     return [e for e, _ in alike][::-1]
 
 
-def _are_exchanged(a: _Verdict, b: _Verdict, chi_square: Callable[[Evidence], float]) -> bool:
+def _are_exchanged(a: _Agreement, b: _Agreement, chi_square: Callable[[Evidence], float]) -> bool:
     """Whether each of two objects is where the other one is on the map."""
     if not (a.is_clear and b.is_clear):
         return False
@@ -135,6 +135,10 @@ def kept_at_trusted_pose(
         return None
     place = state.odometry_from_robot
     known = propagated_pose(memory.trusted, place)
+    # One that was not lost has kept to what agrees, and knows its pose better
+    was_lost, present = state.memory.recovery.lost, state.estimate
+    is_there = not was_lost and agrees(known, present, stands=True)
+    known = present if is_there else known
     xx, _, yy, _, _, hh = known.covariance
     if 0.5 * (xx + yy) > KNOWN_M**2 or hh > KNOWN_RAD**2:
         return None
@@ -147,7 +151,6 @@ def kept_at_trusted_pose(
             return None
         if not explains_as_well(known, found, latest, place):
             return None
-    is_there = not memory.lost and agrees(known, state.estimate, stands=True)
     until_ns = state.stamp_ns + UNUSED_NS
     memory = memory._replace(
         lost="",

@@ -142,8 +142,7 @@ class RecoveryMemory(NamedTuple):
     trusted: TrustedPose | None = None  # from before that, while it does
     mistake: str = ""  # of its driver, that explains what it rejects; it does not move meanwhile
     jump: Jump | None = None  # the latest
-    misplaced: Mapping[str, int] = _NONE
-    """Objects that contradicted a robot that was where it was, and until when each is not used."""
+    misplaced: Mapping[str, int] = _NONE  # objects that stand elsewhere: until when not used
 
     def unused_objects(self, now_ns: int) -> frozenset[str]:
         """Those of `misplaced` that are not used now."""

@@ -12,9 +12,10 @@ from support.processes import cpcbl_team
 from cpcbl_launch.lab.evaluation import evaluate_log
 from cpcbl_launch.lab.evaluation import evaluate_log as evaluated_log
 from cpcbl_launch.reporting.recorder import Report
-from cpcbl_launch.run.logged_team import builtin_for, load_logged_team
+from cpcbl_launch.run.logged_team import builtin_for, load_logged_team, with_duration
 from cpcbl_launch.team.file import builtin_path, load_team
 from cpcbl_launch.team.overrides import Overrides, with_blind_robots, with_overrides
+from cpcbl_team.config import Field
 
 pytestmark = [pytest.mark.log, pytest.mark.timeout(900)]
 
@@ -40,6 +41,23 @@ def evaluated(name: str, blind: bool, choice: Overrides, calibrated: bool = True
 def team_rmse_m(report: Report) -> float:
     assert report.team.position_rmse_m is not None
     return report.team.position_rmse_m
+
+
+@pytest.mark.parametrize("kind", ["exchanged", "moved"])
+def test_wrong_places_on_the_map_lead_nobody_astray(kind: str) -> None:
+    """Robots look at one landmark for long: it was taken for being elsewhere (0.39 and 0.10 m)."""
+    folder = log_folder("MRCLAM4")
+    logged = load_logged_team(load_team(builtin_for(folder)), folder)
+    marks = dict(logged.team.map.landmarks)
+    if kind == "exchanged":
+        marks["9"], marks["16"] = marks["16"], marks["9"]
+    else:
+        marks["10"] = msgspec.structs.replace(marks["10"], x_m=marks["10"].x_m + 0.6)
+    team = msgspec.structs.replace(logged.team, map=Field(landmarks=marks))
+    report = evaluate_log(with_duration(logged._replace(team=team), 600.0)).report
+    assert team_rmse_m(report) <= 0.05
+    assert report.team.nees is not None
+    assert report.team.nees < 3.0
 
 
 def test_blind_robots_are_carried_by_their_teammates() -> None:
