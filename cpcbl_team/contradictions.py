@@ -65,7 +65,7 @@ def misplaced_objects(
     if not found and len(wrong) == 2:
         a, b = wrong.values()
         found = set(wrong) if _are_exchanged(a, b, chi_square) else found
-    return frozenset(found) if 2 * len(found) <= len(names) else frozenset()
+    return frozenset(found)
 
 
 def explains_as_well(
@@ -143,6 +143,9 @@ def kept_at_trusted_pose(
     if 0.5 * (xx + yy) > KNOWN_M**2 or hh > KNOWN_RAD**2:
         return None
     misplaced = misplaced_objects(known, evidence, place, names)
+    unused = misplaced | memory.unused_objects(state.stamp_ns)
+    if 2 * len(unused) > len(names):
+        return None
     if misplaced and explaining_mistake(state, memory, evidence, None):
         return None  # nothing can be said of objects before the driver is mended
     if not misplaced:

@@ -7,11 +7,16 @@ import pytest
 from support.core import diagonal
 
 from cpcbl_team.config import LocalizationSettings
-from cpcbl_team.contradictions import UNUSED_NS, explains_as_well, misplaced_objects
+from cpcbl_team.contradictions import (
+    UNUSED_NS,
+    explains_as_well,
+    kept_at_trusted_pose,
+    misplaced_objects,
+)
 from cpcbl_team.estimate import Estimate
 from cpcbl_team.geometry import Pose2
 from cpcbl_team.object_timers import ObjectTimers
-from cpcbl_team.state import Evidence, Memory, RecoveryMemory, State
+from cpcbl_team.state import Evidence, Memory, RecoveryMemory, State, TrustedPose
 
 S = 1_000_000_000
 HERE = Pose2(1.0, 1.0, 0.3)
@@ -87,11 +92,22 @@ def test_two_that_stand_where_the_other_is_on_the_map_are_exchanged() -> None:
     assert misplaced(*turned) == frozenset()
 
 
-def test_more_than_half_of_the_map_is_never_accused() -> None:
+@pytest.mark.parametrize(
+    ("before", "is_kept"), [({}, True), ({"c": S}, True), ({"c": 3 * S}, False)]
+)
+def test_no_more_than_half_of_the_map_is_unused(before: dict[str, int], is_kept: bool) -> None:
     places = MAP | {"a": MAP["b"], "b": MAP["a"]}
     wrong = [seen(name, at_s, places=places) for at_s in (1.0, 1.5, 2.0) for name in "ab"]
-    assert misplaced_objects(KNOWN, wrong, Pose2(0.0, 0.0, 0.0), "abc") == frozenset()
-    assert misplaced_objects(KNOWN, wrong, Pose2(0.0, 0.0, 0.0), "abcd") == {"a", "b"}
+    trusted = TrustedPose(KNOWN, Pose2(0.0, 0.0, 0.0))
+    memory = RecoveryMemory(lost="rejects", trusted=trusted, misplaced=before)
+    state = State(2 * S, KNOWN, memory=Memory(memory))
+    kept = kept_at_trusted_pose(state, memory, wrong, MAP, None)
+    assert (kept is not None) is is_kept
+    if kept is not None:
+        recovery, estimate = kept
+        assert recovery.unused_objects(2 * S) == {"a", "b"}
+        assert estimate is not None
+        assert estimate.pose == pytest.approx(HERE)
 
 
 @pytest.mark.parametrize(("robot", "is_explained"), [(HERE, True), (ELSEWHERE, False)])
