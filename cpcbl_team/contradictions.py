@@ -19,7 +19,7 @@ from cpcbl_team.trusted_pose import LATEST_NS, agrees, explaining_mistake, propa
 KNOWN_M: Final = 0.25  # sigmas of a pose at which agreement is no chance
 KNOWN_RAD: Final = 0.15
 AGREEMENT: Final = 9.2  # the chi-square of a piece that agrees (99 % of two readings)
-LEAST_CONTRADICTIONS: Final = 3  # the latest pieces of an object that contradict
+LEAST_CONTRADICTIONS: Final = 3  # pieces of evidence: fewer may be outliers
 READINGS: Final = 2  # that must agree for each object that contradicts
 UNUSED_NS: Final = 120_000_000_000  # for so long such an object is not used; then it is tried again
 
@@ -79,6 +79,13 @@ def explains_as_well(
         for pose in (known, found)
     )
     return bool(own) and at_known <= at_found
+
+
+def contradicts(known: Estimate, evidence: Sequence[Evidence], odometry_from_robot: Pose2) -> bool:
+    """Whether so many pieces of evidence contradict a pose that they are no outliers (names that
+    were misread, reflections)."""
+    far = [e for e in evidence if _chi_square(known, e, odometry_from_robot) >= OUTLIER]
+    return len(far) >= LEAST_CONTRADICTIONS
 
 
 def _chi_square(known: Estimate, e: Evidence, odometry_from_robot: Pose2) -> float:

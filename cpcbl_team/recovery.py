@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from typing import Final
 
 from cpcbl_team.config import Field, LocalizationSettings
-from cpcbl_team.contradictions import kept_at_trusted_pose
+from cpcbl_team.contradictions import contradicts, kept_at_trusted_pose
 from cpcbl_team.estimate import Estimate
 from cpcbl_team.inflation import inflate_covariance, inflate_to
 from cpcbl_team.initial_pose import estimate_of
@@ -123,6 +123,8 @@ class Recovery:
         record = state.memory.calibration.stationary
         stands = record is not None and record.checkpoints[0].stamp_ns <= memory.suspected_ns
         if found is None or agrees(state.estimate, found, stands):
+            return with_recovery(state, memory)
+        if not contradicts(state.estimate, own, state.odometry_from_robot):
             return with_recovery(state, memory)
         if mistake := self._explaining_mistake(state, memory, found, own):
             return self._at_trusted_pose(state.counted("lost"), memory, mistake)

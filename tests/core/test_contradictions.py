@@ -9,6 +9,7 @@ from support.core import diagonal
 from cpcbl_team.config import LocalizationSettings
 from cpcbl_team.contradictions import (
     UNUSED_NS,
+    contradicts,
     explains_as_well,
     kept_at_trusted_pose,
     misplaced_objects,
@@ -117,6 +118,12 @@ def test_another_pose_must_fit_better_than_the_trusted_one(
     evidence = [seen(name, 1.0, robot) for name in "abc"]
     found = Estimate(ELSEWHERE, diagonal(0.05, 0.03))
     assert explains_as_well(KNOWN, found, evidence, Pose2(0.0, 0.0, 0.0)) is is_explained
+
+
+@pytest.mark.parametrize(("wrong", "is_contradicted"), [(2, False), (3, True)])
+def test_an_outlier_or_two_contradict_no_pose(wrong: int, is_contradicted: bool) -> None:
+    evidence = [seen("a", 0.5 * i, ELSEWHERE) for i in range(wrong)] + [seen("b", 2.0)]
+    assert contradicts(KNOWN, evidence, Pose2(0.0, 0.0, 0.0)) is is_contradicted
 
 
 def test_what_teammates_report_does_not_count() -> None:

@@ -5,6 +5,7 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 from support.core import (
     diagonal,
     displaced,
@@ -18,6 +19,7 @@ from support.core import (
 
 from cpcbl_team.config import Field, Landmark, SensorSettings, Variant
 from cpcbl_team.geometry import Pose2
+from cpcbl_team.inputs import Sighting
 from cpcbl_team.misplacements import MISPLACED, misplacements
 from cpcbl_team.state import State
 
@@ -102,3 +104,27 @@ def test_one_that_is_carried_away_is_found_there(variant: Variant, carried: Pose
         assert all(right[120:])
         silent = [position_error(s.estimate, truth) > 0.5 and not s.lost for s, truth in after]
         assert sum(silent) < 30
+
+
+@pytest.mark.parametrize("variant", ["joint", "oval"])
+def test_misread_names_move_nobody_and_make_no_sensor_worse(variant: Variant) -> None:
+    """Of the names that are read 12 % are wrong, as of small markers. What is rejected then is far
+    off, which a larger sigma of the sensor does not explain."""
+    for seed in range(2):
+        rng = np.random.default_rng(seed)
+        robot, begin = localizer(variant, RING, sensor=SENSOR), diagonal(0.1, 0.05)
+        state, noise = state_at(displaced(START, begin, rng), begin), sensor_noise(rng, SENSOR)
+
+        def misread(seen: Sighting) -> Sighting:
+            if rng.random() > 0.12:  # noqa: B023
+                return noise(seen)  # noqa: B023
+            return replace(noise(seen), id=f"m{rng.integers(8)}")  # noqa: B023
+
+        for i, (odometry, truth) in enumerate(driven(START, CIRCLE * 3)):
+            names = [f"m{i // 10 % 8}", f"m{(i // 10 + 2) % 8}"]
+            state = robot.add_odometry(state, odometry)
+            seen = frame(truth, odometry.stamp_ns, RING, names, misread)
+            state = robot.cycle(state, seen)
+            assert state.lost or position_error(state.estimate, truth) < 0.5
+        assert state.memory.calibration.adaptation.sensor_factor == 1.0
+        assert state.memory.calibration.adaptation.motion_factor == 1.0
