@@ -21,7 +21,6 @@ from cpcbl_agents.teammate_frames import TeammateFrames
 from cpcbl_team import information_gain as gains
 from cpcbl_team.config import LocalizationSettings
 from cpcbl_team.fixes import fix_for, with_sensor_factor, without_heading
-from cpcbl_team.frames import FrameOrder
 from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.information_gain import FixMemory, HeadingMemory
 from cpcbl_team.inputs import Belief, Fix, HeadingBelief, LandmarkBelief
@@ -68,7 +67,7 @@ class CollaborationAgent:
         self._robot, self._settings, self._teammates = robot, settings, teammates
         self.guests = guests or GuestRegistry()
         self.landmarks = sharing or LandmarkSharing(robot, frozenset())
-        self.frames = frames or TeammateFrames(robot, teammates, FrameOrder({}))
+        self.frames = frames or TeammateFrames(robot, teammates)
         self._rules, self.budget = settings.collaboration, budget
         if settings.localizer.variant == "weighted":  # without a covariance there is no gain
             self._rules = replace(self._rules, least_value=0.0, least_use=0.0, belief_share=0.0)
