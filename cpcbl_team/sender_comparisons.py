@@ -52,6 +52,15 @@ def votes(senders: SenderRecords, side: Collection[str], sides: Collection[str])
     return len(side) - guests + max(0, min(guests, most))
 
 
+def voters(senders: SenderRecords, now_ns: int) -> list[str]:
+    """The recent teammates that have a vote, as `votes` counts them. Of guests with one vote it is
+    the first by name: any rule does, as long as it is one of them."""
+    recent = sorted(name for name, _ in recent_senders(senders, now_ns) if name != OWN_SENSORS)
+    guests = [name for name in recent if senders[name].is_guest]
+    members = [name for name in recent if not senders[name].is_guest]
+    return members + guests[: votes(senders, guests, recent)]
+
+
 def voting_means(senders: SenderRecords, now_ns: int, name: str, of: int) -> dict[str, MeanOffset]:
     """The precise means (`of`: FAST or SLOW) of the recent sources but `name`, and of the silent
     parties of contests with them; of guests as far as they have a vote, see `votes`."""

@@ -35,7 +35,14 @@ from cpcbl_team.frames import (
     knows_field,
     knows_map,
 )
-from cpcbl_team.inputs import BeliefShared, InitialPose, InputsMended, SightingFault
+from cpcbl_team.inputs import (
+    BeliefShared,
+    InitialPose,
+    InputsMended,
+    LandmarkBelief,
+    SightingFault,
+)
+from cpcbl_team.landmark_claims import LandmarkClaims
 from cpcbl_team.recovery import rejected_of
 from cpcbl_team.state import CalibrationMemory, Jump, pose_of
 from cpcbl_team.trust import TrustStatus
@@ -100,6 +107,7 @@ class Robot:
         agent = name, settings, teammates, start_ns, budget, guests, sharing, mates
         self.collaboration = CollaborationAgent(*agent)
         self._teammates = teammates
+        self._claims = LandmarkClaims(team, settings.collaboration.trust.least_sigma_m)
 
     def handle(
         self, message: Message | Tick | BusEvent, now_ns: int, frame: str = FIELD
@@ -117,6 +125,8 @@ class Robot:
             return []
         if isinstance(message, Help):  # it changes what is published at the next tick
             if frame == self.filter.frame:
+                if isinstance(message, LandmarkBelief):
+                    message = self._claims.believed(message)
                 self.filter.handle(self.collaboration.as_used(message), now_ns)
             else:
                 self.filter.handle_from_elsewhere(message, self._teammates, frame, now_ns)
