@@ -140,7 +140,9 @@ def run_attack(attack: Attack, seed: int) -> AttackRun:
     correct = [n for name, n in zip(team.robots, nodes, strict=True) if name not in attack.liars]
     fault = Fault.parse(f"{attack.lie}@{attack.from_s}-") if attack.lie else None
     liars = (
-        [] if fault is None else [_liar(attack, hub, fault, name, seed) for name in attack.liars]
+        []
+        if fault is None
+        else [_lying_observer(attack, hub, fault, name, seed) for name in attack.liars]
     )
     run_nodes([field, *correct, *liars], 0, int(attack.end_s * 1e9))
     truth = recorder.simulated_truth()[attack.victim]
@@ -152,7 +154,7 @@ def run_attack(attack: Attack, seed: int) -> AttackRun:
     return AttackRun(of_victim, after_s, len(quarantined & set(attack.honest)))
 
 
-def _liar(
+def _lying_observer(
     attack: Attack, hub: MemoryHub, fault: Fault, name: str, seed: int
 ) -> LyingObserver | RenamedLiar:
     told = attack.victim, *attack.bystanders
