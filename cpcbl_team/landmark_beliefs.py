@@ -14,6 +14,7 @@ from cpcbl_team.config import Field, LocalizationSettings
 from cpcbl_team.fusion import chi_square_bounds
 from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.inputs import LandmarkBelief
+from cpcbl_team.recovery_evidence import is_in_quarantine
 from cpcbl_team.state import State, with_landmark
 from cpcbl_team.teammates import TeammateScreen
 
@@ -50,7 +51,8 @@ class LandmarkBeliefs:
         still."""
         if belief.landmark not in self._unsurveyed or not self._passive:
             return state
-        state = with_landmark(state, belief)
+        if not is_in_quarantine(state, belief.robot):  # else it would silence the others
+            state = with_landmark(state, belief)
         found = self._compared(state, belief)
         if found is None:
             return state

@@ -301,6 +301,8 @@ class Localizer:
             observation = self.screen.with_caution(state, observation)
             position = observation.of_position(prior.pose)
         if nis > self._gates[1]:
+            if self.screen.has_no_vote(state, observation.sender):  # whether the robot is lost
+                return self.recovery.check(state.counted("distrusted"))
             return self.recovery.check(self._with_update(state, prior, None, {}, 1))
         by_teammate = observation.observer is not None
         if self._common is not None:

@@ -8,7 +8,7 @@ its rival says that the robot is.
 """
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from functools import reduce
 from typing import Final
 
@@ -25,6 +25,7 @@ from cpcbl_team.mean_offsets import (
     compared_with_majority,
     compared_with_own_sensors,
     contradicts,
+    disagreement,
 )
 from cpcbl_team.sender_records import NEVER_NS, Rival, SenderRecord
 
@@ -42,10 +43,27 @@ def recent_senders(
             yield name, r
 
 
+def votes(senders: SenderRecords, side: Collection[str], sides: Collection[str]) -> int:
+    """The votes of one side of a dispute between all `sides`. Anybody may come as several guests:
+    beside two robots of the team they have no vote, and beside one they have one together."""
+    members = sum(not senders[name].is_guest for name in sides)
+    guests = sum(senders[name].is_guest for name in side)
+    most = guests if members == 0 else 2 - members
+    return len(side) - guests + max(0, min(guests, most))
+
+
+def voters(senders: SenderRecords, now_ns: int) -> list[str]:
+    """The recent teammates that have a vote, as `votes` counts them. Of guests with one vote it is
+    the first by name: any rule does, as long as it is one of them."""
+    recent = sorted(name for name, _ in recent_senders(senders, now_ns) if name != OWN_SENSORS)
+    guests = [name for name in recent if senders[name].is_guest]
+    members = [name for name in recent if not senders[name].is_guest]
+    return members + guests[: votes(senders, guests, recent)]
+
+
 def voting_means(senders: SenderRecords, now_ns: int, name: str, of: int) -> dict[str, MeanOffset]:
     """The precise means (`of`: FAST or SLOW) of the recent sources but `name`, and of the silent
-    parties of contests with them. Guests have no vote beside two robots of the team, of which
-    `name` may be one."""
+    parties of contests with them; of guests as far as they have a vote, see `votes`."""
     means = {
         other: mean
         for other, r in recent_senders(senders, now_ns, name)
@@ -53,10 +71,24 @@ def voting_means(senders: SenderRecords, now_ns: int, name: str, of: int) -> dic
         and mean.is_precise
         and now_ns - r.offsets[of].stamp_ns <= RECENT_NS
     }
-    guests = {sender for sender in (*means, name) if senders[sender].is_guest}
-    if len({*means, name} - guests - {OWN_SENSORS}) >= 2:
-        means = {other: mean for other, mean in means.items() if other not in guests}
-    return means | _means_of_silent(senders, name, means, now_ns, of)
+    means = _with_votes(senders, name, means, of)
+    means |= _means_of_silent(senders, name, means, now_ns, of)
+    return _with_votes(senders, name, means, of)
+
+
+def _with_votes(
+    senders: SenderRecords, name: str, means: dict[str, MeanOffset], of: int
+) -> dict[str, MeanOffset]:
+    """The means without those of guests that have no vote on `name`. The one vote of several guests
+    is that of the one that agrees most with the robot of the team that they speak of."""
+    guests = [other for other in means if senders[other].is_guest]
+    members = len({*means, name} - {OWN_SENSORS, *guests}) - senders[name].is_guest
+    if not guests or not members:
+        return means
+    mean, voting = senders[name].means[of], set[str]()
+    if members == 1 and not senders[name].is_guest and mean is not None:
+        voting.add(min(guests, key=lambda other: disagreement(mean, means[other])))
+    return {n: m for n, m in means.items() if n in voting or not senders[n].is_guest}
 
 
 def _means_of_silent(

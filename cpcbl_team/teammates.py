@@ -35,7 +35,13 @@ from cpcbl_team.measurements import (
     observation_of,
 )
 from cpcbl_team.recovery_evidence import without_senders
-from cpcbl_team.sender_comparisons import OWN_SENSORS, RECENT_NS, SenderRecords, contest_m
+from cpcbl_team.sender_comparisons import (
+    OWN_SENSORS,
+    RECENT_NS,
+    SenderRecords,
+    contest_m,
+    voters,
+)
 from cpcbl_team.sender_records import NEVER_NS, OffsetEvidence, ReportedPosition, TeammateReport
 from cpcbl_team.state import State, with_memory, with_senders, with_teammates
 
@@ -172,6 +178,13 @@ class TeammateScreen:
                 record.bias_variance, contest_m(state.memory.teammates.senders, sender) ** 2
             )
         return dependent + Covariance2(more, 0.0, more) if more else dependent
+
+    def has_no_vote(self, state: State, sender: str) -> bool:
+        """Whether this is a guest whose rejected reports do not tell that the robot is lost: beside
+        robots of the team, several guests could make it lost whenever they like."""
+        if not self.is_active or not self._is_guest(sender):
+            return False
+        return sender not in voters(state.memory.teammates.senders, state.stamp_ns)
 
     def _is_guest(self, sender: str) -> bool:
         return self._teammates is not None and sender not in self._teammates

@@ -31,6 +31,7 @@ from cpcbl_team.sender_comparisons import (
     contest_m,
     open_rivals,
     recent_senders,
+    votes,
     voting_means,
     with_comparison,
     wrong_turn,
@@ -219,8 +220,9 @@ def _is_estimate_right(
     conflicting = {n for n in all_sides if is_in_conflict(recent[n], began_ns)}
     if not all_sides <= conflicting:
         dissenters, supporters = dissenters - conflicting, supporters - conflicting
-    if len(supporters) != len(dissenters):
-        return len(supporters) > len(dissenters)
+    for_it, against = (votes(recent, side, all_sides) for side in (supporters, dissenters))
+    if for_it != against:
+        return for_it > against
     return True if now_ns - began_ns >= TIE_NS else None
 
 
@@ -275,7 +277,8 @@ def _outvoted_majority(decision: TrustDecision, now_ns: int) -> frozenset[str]:
         and now_ns - r.since_ns <= MAJORITY_NS
         and all(math.dist(r.mean_offset, o) <= ALIKE_M + 0.5 * math.hypot(*o) for o in new)
     )
-    return out if 2 * len(out) >= len(recent) else frozenset()
+    is_half = 2 * votes(recent, out, recent) >= votes(recent, recent, recent)
+    return out if is_half else frozenset()
 
 
 def _without_decision(decision: TrustDecision, out: frozenset[str], now_ns: int) -> TrustDecision:
@@ -340,7 +343,8 @@ def united_majority(senders: SenderRecords, now_ns: int) -> tuple[str, ...]:
     }
     agreed_ns = max((r.last_agreement_ns for r in senders.values()), default=now_ns)
     against = {n: r for n, r in heard.items() if r.last_failure_ns > agreed_ns}
-    if len(against) < LEAST_UNITED or 2 * len(against) <= len(heard):
+    number = votes(heard, against, heard)
+    if number < LEAST_UNITED or 2 * number <= votes(heard, heard, heard):
         return ()
     positions = [r.position for r in against.values() if r.position is not None]
     since = [p for p in positions if p.stamp_ns > agreed_ns]

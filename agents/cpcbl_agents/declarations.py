@@ -3,7 +3,7 @@
 After a change it declares the new first and then takes the old back, so that nothing is missed.
 """
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from typing import TypeVar
 
 from cpcbl_agents.agent import Presence, TeammateFrame
@@ -16,6 +16,7 @@ from cpcbl_transport.bus import Bus, Handle, LivelinessCallback, MessageCallback
 from cpcbl_transport.topics import Topic, tier_chunk
 
 Value = TypeVar("Value")
+MOST_TOKENS = 16  # of one robot are kept, the newest
 _TIERS = {str(tier): tier for tier in range(LOWEST_TIER + 1)}
 _BY_TIER = tuple(topic.key.split("/")[0] + "/" for topic in (topics.BELIEF, topics.FIX))
 
@@ -153,13 +154,17 @@ def _declare(
 class LivelinessTokens:
     """The tokens of teammates. A teammate may have two for a while; the newest counts."""
 
-    def __init__(self) -> None:
+    def __init__(self, members: Collection[str] | None = None) -> None:
+        """`members`: of the team, of whose frames all are told; None: of all robots."""
+        self._members = members
         self._tiers: dict[str, dict[str, tuple[int, str]]] = {}
         self._frames: dict[str, dict[str, str]] = {}
 
     def update(self, key: str, alive: bool) -> Presence | TeammateFrame | None:
         """What is known of a teammate by now; None if the key is no robot's token."""
         if names := topics.FRAME.names(key):
+            if self._members is not None and names["robot"] not in self._members:
+                return TeammateFrame(names["robot"], None)
             frame = FIELD if names["frame"] == frame_text(FIELD) else names["frame"]
             newest_frame = _newest(self._frames, names["robot"], key, frame, alive)
             return TeammateFrame(names["robot"], newest_frame)
@@ -183,6 +188,8 @@ def _newest(
     tokens.pop(key, None)
     if alive:
         tokens[key] = value
+        if len(tokens) > MOST_TOKENS:
+            del tokens[next(iter(tokens))]
     if not tokens:
         del by_robot[robot]  # guests come under ever new names
     return next(reversed(tokens.values()), None)

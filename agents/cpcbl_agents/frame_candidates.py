@@ -9,9 +9,10 @@ knows no map, begins another frame.
 from typing import Final, NamedTuple
 
 from cpcbl_agents.agent import FrameChanged
+from cpcbl_agents.frame_claims import FrameClaims
 from cpcbl_team.config import Field
 from cpcbl_team.frame_changes import begun_in_frame, frame_change
-from cpcbl_team.frames import ORIGIN, FrameOrder, frame_name
+from cpcbl_team.frames import ORIGIN, frame_name
 from cpcbl_team.inputs import Belief, Fix, Input, LandmarkBelief
 from cpcbl_team.state import State
 from cpcbl_team.timeline import Timeline
@@ -67,10 +68,10 @@ class RobotFrames:
     """The frame of one robot, and its candidates in better ones: the best `MOST_CANDIDATES`."""
 
     def __init__(
-        self, robot: str, frame: str, order: FrameOrder, field: Field, knows_map: bool
+        self, robot: str, frame: str, claims: FrameClaims, field: Field, knows_map: bool
     ) -> None:
         """`frame`: in which it begins. `knows_map`: so that it can find itself in the field."""
-        self.frame, self.order = frame, order
+        self.frame, self.claims = frame, claims
         self._robot, self._field, self._knows_map = robot, field, knows_map
         self.candidates: dict[str, Candidate] = {}
         self._lost_since_ns: int | None = None
@@ -82,7 +83,7 @@ class RobotFrames:
 
     def add_help(self, help_: FrameHelp, frame: str, own: Timeline, now_ns: int) -> bool:
         """Help in another frame than that of `own`; whether a candidate takes it."""
-        if not self.order.is_better(frame, self.frame):
+        if not self.claims.is_better(frame, self.frame):
             return False
         candidate = self.candidates.get(frame)
         if candidate is None:
@@ -101,8 +102,8 @@ class RobotFrames:
         """Whether a candidate of this frame may be kept: the best are."""
         if len(self.candidates) < MOST_CANDIDATES:
             return True
-        worst = max(self.candidates, key=self.order.rank)
-        if not self.order.is_better(frame, worst):
+        worst = max(self.candidates, key=self.claims.rank)
+        if not self.claims.is_better(frame, worst):
             return False
         del self.candidates[worst]
         return True
@@ -110,11 +111,13 @@ class RobotFrames:
     def next_change(self, own: Timeline, now_ns: int) -> Change | None:
         """Where the robot goes on from now on: in the best frame in which it has found its pose, or
         in one that it begins; None where it stays in its own."""
-        for frame in sorted(self.candidates, key=self.order.rank):
+        for frame in sorted(self.candidates, key=self.claims.rank):
             candidate = self.candidates[frame]
-            if candidate.is_ready(now_ns):
+            if not self.claims.is_better(frame, self.frame):
+                del self.candidates[frame]
+            elif candidate.is_ready(now_ns):
                 return self._change(own, candidate.timeline, frame, JOINED, now_ns)
-            if candidate.is_given_up(now_ns):
+            elif candidate.is_given_up(now_ns):
                 del self.candidates[frame]
         state = own.latest(now_ns)
         if self._knows_map or not state.lost or state.memory.recovery.mistake:
@@ -131,7 +134,7 @@ class RobotFrames:
         left = own.latest(now_ns)
         new.add(frame_change(left))
         self.frame, self._lost_since_ns = frame, None
-        better = self.order.better(self.candidates, frame)
+        better = self.claims.better(self.candidates, frame)
         self.candidates = {name: self.candidates[name] for name in better}
         new_from_old = None
         if not left.lost:

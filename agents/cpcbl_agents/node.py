@@ -119,7 +119,7 @@ class Node:
             robot.name, incarnation, rules, bus, put_message, put_token, is_agreed
         )
         self._pose = PoseOutput(robot, bus, team.robots[robot.name].pose_rate_hz, start_ns)
-        self._tokens = LivelinessTokens()
+        self._tokens = LivelinessTokens(self._team)
         self._subscribed: dict[object, str] = {BeliefSubscribers: "", FrameSubscribers: ""}
         self._explained: set[tuple[str, Refusal]] = set()
         self._counts: Counter[str] = Counter()

@@ -16,6 +16,7 @@ from cpcbl_agents.clocks import ClockMonitor
 from cpcbl_agents.collaboration import CollaborationAgent
 from cpcbl_agents.filtering import FilterAgent
 from cpcbl_agents.frame_candidates import RobotFrames
+from cpcbl_agents.frame_claims import FrameClaims
 from cpcbl_agents.guests import GuestRegistry
 from cpcbl_agents.landmark_sharing import LandmarkSharing
 from cpcbl_agents.sensing import SensingAgent
@@ -25,8 +26,23 @@ from cpcbl_agents.waypoint_follower import WaypointFollower
 from cpcbl_team.common_error_filter import considers_camera
 from cpcbl_team.config import Team
 from cpcbl_team.estimate import Estimate
-from cpcbl_team.frames import FIELD, ORIGIN, FrameOrder, begins_frame, frame_name, knows_map
-from cpcbl_team.inputs import BeliefShared, InitialPose, InputsMended, SightingFault
+from cpcbl_team.frames import (
+    FIELD,
+    ORIGIN,
+    FrameOrder,
+    begins_frame,
+    frame_name,
+    knows_field,
+    knows_map,
+)
+from cpcbl_team.inputs import (
+    BeliefShared,
+    InitialPose,
+    InputsMended,
+    LandmarkBelief,
+    SightingFault,
+)
+from cpcbl_team.landmark_claims import LandmarkClaims
 from cpcbl_team.lost_reasons import rejected_of
 from cpcbl_team.state import CalibrationMemory, Jump, pose_of
 from cpcbl_team.trust import TrustStatus
@@ -72,8 +88,9 @@ class Robot:
         self.start = RobotStart(start_ns, team.robots[name].start is not None, restarted)
         camera = settings.camera if settings.sensing == "camera" else None
         shared = frozenset(team.map.unsurveyed)
-        order = FrameOrder(team.robots)
-        frames = robot_frames(name, team, start_ns, order)
+        is_field_known = any(knows_field(team, robot) for robot in team.robots)
+        claims = FrameClaims(name, FrameOrder(team.robots), is_field_known)
+        frames = robot_frames(name, team, start_ns, claims)
         if begins_frame(team, name):
             settings = replace(settings, start=ORIGIN)
         self.filter = FilterAgent(
@@ -105,10 +122,11 @@ class Robot:
                 team.guests.most if team.guests.allowed else 0,
             ),
             landmarks=LandmarkSharing(name, shared, len(team.robots)),
-            frames=TeammateFrames(name, teammates, order),
+            frames=TeammateFrames(name, teammates, claims),
         )
         self.collaboration.frames.begin_frame(self.filter.frame)
         self._teammates = teammates
+        self._claims = LandmarkClaims(team, settings.collaboration.trust.least_sigma_m)
 
     def handle(
         self, message: Message | Tick | BusEvent, now_ns: int, frame: str = FIELD
@@ -126,6 +144,8 @@ class Robot:
             return []
         if isinstance(message, Help):  # it changes what is published at the next tick
             if frame == self.filter.frame:
+                if isinstance(message, LandmarkBelief):
+                    message = self._claims.believed(message)
                 self.filter.handle(self.collaboration.as_used(message), now_ns)
             else:
                 self.filter.handle_from_elsewhere(message, self._teammates, frame, now_ns)
@@ -264,12 +284,12 @@ class Robot:
             yield Trust(*status[:5], late_s, status.contested)
 
 
-def robot_frames(name: str, team: Team, start_ns: int, order: FrameOrder) -> RobotFrames | None:
+def robot_frames(name: str, team: Team, start_ns: int, claims: FrameClaims) -> RobotFrames | None:
     """The frames of this robot; None in a team whose frame is that of the map."""
     if not team.map.is_frame_agreed:
         return None
     frame = frame_name(name, start_ns) if begins_frame(team, name) else FIELD
-    return RobotFrames(name, frame, order, team.map_of(name), knows_map(team, name))
+    return RobotFrames(name, frame, claims, team.map_of(name), knows_map(team, name))
 
 
 def build_robot(

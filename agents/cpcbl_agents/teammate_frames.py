@@ -7,6 +7,7 @@ of its team alone, lest a guest draws it away.
 
 from collections.abc import Collection, Iterable, Iterator, Mapping
 
+from cpcbl_agents.frame_claims import FrameClaims
 from cpcbl_agents.landmark_sharing import LandmarkSharing, known_tiers
 from cpcbl_team.config import CollaborationSettings
 from cpcbl_team.frames import FIELD, FrameOrder
@@ -19,13 +20,15 @@ from cpcbl_transport.topics import ANY_TIER, tier_chunk
 class TeammateFrames:
     """What one robot knows of the tiers and frames of the others."""
 
-    def __init__(self, robot: str, members: Collection[str], order: FrameOrder) -> None:
+    def __init__(
+        self, robot: str, members: Collection[str], claims: FrameClaims | None = None
+    ) -> None:
         """`members`: the other robots of the team file."""
         self.frame = FIELD
         """That of the robot itself."""
-        self._robot, self._members, self._order = robot, frozenset(members), order
+        self._robot, self._members = robot, frozenset(members)
+        self._claims = claims or FrameClaims(robot, FrameOrder({}))
         self._announced: dict[str, tuple[int, str]] = {}
-        self._frames: dict[str, str] = {}
         self._known: dict[str, dict[str, int]] = {}
         self.tiers: dict[str, int] = {}
         """The tiers of those to whom it may be of help: of those in worse frames the lowest."""
@@ -34,10 +37,8 @@ class TeammateFrames:
 
     def begin_frame(self, frame: str) -> None:
         """The robot is in this frame from now on."""
-        self.frame, announced = frame, self._announced
-        self._known, self._announced, self.tiers = {}, {}, {}
-        for name, (tier, its_frame) in announced.items():
-            self.set_tier(name, tier, its_frame)
+        self.frame = self._claims.own = frame
+        self._known = {}
         self._select_better()
 
     def set_tier(self, name: str, tier: int | None, frame: str) -> None:
@@ -49,18 +50,21 @@ class TeammateFrames:
         self._announced[name] = tier, frame
         if frame == self.frame:
             self.tiers[name] = tier
-        elif self._order.is_better(self.frame, frame):
+        elif self._claims.is_better(self.frame, frame):
             self.tiers[name] = LOWEST_TIER
 
     def set_frame(self, name: str, frame: str | None) -> None:
         """A robot of the team says in which frame it is; None: it is gone."""
-        self._frames.pop(name, None)
-        if frame is not None and name in self._members:
-            self._frames[name] = frame
-        self._select_better()
+        if name in self._members:
+            self._claims.set_frame(name, frame)
+            self._select_better()
 
     def _select_better(self) -> None:
-        self.better_frames = self._order.better(self._frames.values(), self.frame)
+        """Selects anew where to look for help, and whom to help."""
+        self.better_frames = self._claims.better_frames
+        announced, self._announced, self.tiers = self._announced, {}, {}
+        for name, (tier, frame) in announced.items():
+            self.set_tier(name, tier, frame)
 
     def forget_places(self) -> None:
         """What is known in better frames comes anew: a pose there may have been given up."""
@@ -101,4 +105,4 @@ class TeammateFrames:
                 yield topics.LANDMARK.at(landmark=landmark, tier=tier_chunk(tier, frame))
 
     def _is_better(self, frame: str) -> bool:
-        return self._order.is_better(frame, self.frame)
+        return self._claims.is_better(frame, self.frame)

@@ -124,6 +124,18 @@ def test_a_robot_that_is_started_again_joins_the_frame_that_it_began_itself() ->
     assert_right(world)
 
 
+def test_of_two_the_one_that_stayed_joins_the_one_that_was_started_again() -> None:
+    """They stayed apart: the frame of the one that stayed is older, and nobody else is in it."""
+    team = unmapped()
+    two = {name: robot for name, robot in team.robots.items() if name != "third"}
+    world = World(replace(team, robots=two), 1).run(6.0)
+    world.stop("pioneer")
+    world.run(1.0).start("pioneer")
+    world.run(10.0)
+    assert set(world.frames.values()) == {frame_name("pioneer", 7_000_000_000)}
+    assert_right(world)
+
+
 @pytest.mark.parametrize("late", ["pioneer", "third"])
 def test_a_robot_that_comes_late_is_in_one_frame_with_the_others(late: str) -> None:
     """The frame of the best robot is better however late it comes, where it is better."""

@@ -2,6 +2,7 @@
 
 import pytest
 
+from cpcbl_agents.frame_claims import FrameClaims
 from cpcbl_agents.landmark_sharing import LandmarkSharing
 from cpcbl_agents.teammate_frames import TeammateFrames
 from cpcbl_team.config import CollaborationSettings, RobotSettings
@@ -17,7 +18,7 @@ RULES = CollaborationSettings()
 
 def mates() -> TeammateFrames:
     """What `me` knows of two teammates, one of them in a better and one in a worse frame."""
-    frames = TeammateFrames("me", ("a", "z"), ORDER)
+    frames = TeammateFrames("me", ("a", "z"), FrameClaims("me", ORDER))
     frames.begin_frame(OWN)
     for name, tier, frame in (("a", 5, BEST), ("z", 2, WORST), ("ghost", 0, GHOSTS)):
         frames.set_tier(name, tier, frame)

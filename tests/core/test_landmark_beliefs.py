@@ -20,7 +20,8 @@ from support.core import (
 from cpcbl_team.config import Field, SensorSettings, Start, Unsurveyed, Variant
 from cpcbl_team.inputs import BeliefShared, Input, LandmarkBelief
 from cpcbl_team.localizer import Localizer
-from cpcbl_team.state import State, with_landmark
+from cpcbl_team.sender_records import QuarantineReason, SenderRecord
+from cpcbl_team.state import State, with_landmark, with_teammates
 from cpcbl_team.timeline import Timeline
 
 EXACT_START = Start(x_m=LOOP_START.x, y_m=LOOP_START.y, sigma_m=0.0, heading_sigma_deg=0.0)
@@ -64,6 +65,17 @@ def test_a_robot_without_a_map_takes_landmarks_where_a_teammate_says(variant: Va
     assert position_error(state.estimate, LOOP_START) < 0.05
     assert state.estimate.position_sigma_m < 0.05
     assert state.estimate.shared == state.estimate.covariance
+
+
+def test_one_in_quarantine_takes_nobody_elses_place() -> None:
+    """With a better one it replaced that of a correct teammate, and was not believed itself."""
+    one = robot(VAGUE_START)
+    state = one.landmark_beliefs.add(one.start(0), belief_about("ne", 0))
+    expelled = SenderRecord(reason=QuarantineReason.BIASED)
+    memory = state.memory.teammates._replace(senders={"liar": expelled})
+    state = with_teammates(state, memory)
+    state = one.landmark_beliefs.add(state, belief_about("ne", 0, 0.001, "liar"))
+    assert state.memory.teammates.trusted_landmarks["ne"].robot == "mate"
 
 
 def test_a_lost_robot_finds_itself_by_what_a_teammate_says() -> None:

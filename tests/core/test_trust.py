@@ -15,11 +15,12 @@ from cpcbl_team.sender_comparisons import OWN_SENSORS
 from cpcbl_team.sender_records import (
     USUAL_NIS,
     OffsetEvidence,
+    QuarantineReason,
     Rival,
     SenderRecord,
     TeammateReport,
 )
-from cpcbl_team.trust import assess, trust_statuses
+from cpcbl_team.trust import assess, trust_statuses, united_majority
 
 
 @pytest.fixture
@@ -54,6 +55,52 @@ def test_a_faulty_sender_that_the_estimate_followed_is_outvoted(receiver: Receiv
     (decision,) = (d for _, d in receiver.decisions if d.event)
     assert decision.quarantined == {"liar"}
     assert decision.estimate_error_m == pytest.approx(0.5)
+
+
+GUESTS = [f"guest{i}" for i in range(5)]
+
+
+def test_guests_do_not_outvote_two_robots_of_the_team(receiver: Receiver) -> None:
+    """Five had both in quarantine within a second, and led the robot 0.5 m away."""
+    receiver.receive(1.0, a=AGREES, b=AGREES, **dict.fromkeys(GUESTS, AGREES))
+    receiver.receive(1.0, a=AGREES, b=AGREES, **dict.fromkeys(GUESTS, CONTRADICTS))
+    assert receiver.quarantined.keys() == {*GUESTS}
+
+
+def test_guests_do_not_outvote_one_robot_of_the_team(receiver: Receiver) -> None:
+    """They are one voice against its own. Nobody knows who is right, and the robot says so."""
+    receiver.receive(1.0, a=AGREES, **dict.fromkeys(GUESTS, AGREES))
+    receiver.receive(3.0, a=AGREES, **dict.fromkeys(GUESTS, CONTRADICTS))
+    assert not receiver.quarantined
+    assert ("guest0", "contested") in receiver.events
+
+
+def test_guests_that_are_quarantined_together_are_not_released_as_a_majority() -> None:
+    right = SenderRecord(last_report_ns=5 * SECOND, last_agreement_ns=5 * SECOND)
+    senders = {"a": right, "b": right}
+    for name in GUESTS:
+        senders[name] = SenderRecord(
+            last_report_ns=5 * SECOND,
+            mean_offset=(0.5, 0.0),
+            reason=QuarantineReason.BIASED,
+            since_ns=4 * SECOND,
+            is_guest=True,
+        )
+    senders[GUESTS[0]] = replace(
+        senders[GUESTS[0]], reason=None, score=2.0 * RULES.limit, dispute_since_ns=4 * SECOND
+    )
+    report = TeammateReport(5 * SECOND, CONTRADICTS, (0.5, 0.0), is_guest=True)
+    decision = assess(senders, GUESTS[0], report, 0, RULES)
+    assert decision.event == "quarantined"
+
+
+def test_guests_alone_do_not_show_a_robot_that_it_is_elsewhere() -> None:
+    against = SenderRecord(last_report_ns=5 * SECOND, last_failure_ns=5 * SECOND)
+    guests = {name: replace(against, is_guest=True) for name in GUESTS}
+    agreeing = replace(against, last_agreement_ns=4 * SECOND, last_failure_ns=0)
+    robots = {"a": agreeing, "b": agreeing}
+    assert united_majority(guests | robots, 5 * SECOND) == ()
+    assert united_majority({"a": against, "b": against}, 5 * SECOND) == ("a", "b")
 
 
 def test_own_sensors_outvote_a_sender_that_the_estimate_followed(receiver: Receiver) -> None:

@@ -93,6 +93,25 @@ def test_own_sensors_reveal_a_sender_with_wrong_headings_only() -> None:
     assert max(errors) < 0.1
 
 
+def test_new_guests_do_not_make_a_robot_lost_that_two_of_its_team_see() -> None:
+    """Seven of names that nobody had heard made it lost within 0.3 s, before any test of trust
+    could judge them."""
+    robots = ("a", "b")
+    robot = localizer(odometry=NOISE, teammates=robots)
+    state = state_at(LOOP_START, diagonal(0.05, 0.05))
+    for piece, truth in driven(LOOP_START, loop()[:60]):
+        now, generation = piece.stamp_ns, piece.stamp_ns // SECOND
+        state = robot.add_odometry(state, piece)
+        right = fix(truth.x, truth.y, now)
+        wrong = replace(right, x_m=truth.x + 0.8)
+        for name in robots:
+            state = robot.add_fix(state, replace(right, observer=name))
+        for k in range(7):
+            state = robot.add_fix(state, replace(wrong, observer=f"guest{k}.{generation}"))
+        assert not state.lost
+    assert "lost" not in state.counts
+
+
 @kinds
 def test_a_small_claimed_covariance_does_not_protect_a_faulty_sender(kind: str) -> None:
     observers: dict[str, Observed] = {"a": correct, "b": correct, "liar": faulty(kind)}

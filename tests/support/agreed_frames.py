@@ -87,6 +87,10 @@ class World:
         node = Node(build_robot(name, self.team, own_ns), self.team, bus, start)
         self.nodes[name], self._steppable[name] = node, ClockAhead(node, ahead_ns)
 
+    def add(self, name: str, make: Callable[[Bus], Steppable]) -> None:
+        """Something else runs beside the robots, under this name."""
+        self._steppable[name] = make(self.hub.session())
+
     def stop(self, name: str) -> None:
         """Its process ends."""
         del self.nodes[name], self._steppable[name]

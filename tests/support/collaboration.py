@@ -19,7 +19,6 @@ from cpcbl_team.config import (
     Variant,
 )
 from cpcbl_team.estimate import Estimate
-from cpcbl_team.frames import FrameOrder
 from cpcbl_team.geometry import Pose2
 from cpcbl_team.inputs import Belief, Fix, Sighting, Sightings
 from cpcbl_transport.budget import Budget
@@ -62,7 +61,7 @@ class Alone:
             budget=Budget(budget, 0),
             guests=GuestRegistry(known=()),
             landmarks=LandmarkSharing("me", names=frozenset(), robots=1 + len(MATES)),
-            frames=TeammateFrames("me", MATES, FrameOrder({})),
+            frames=TeammateFrames("me", MATES),
         )
         self.now_ns = 0
         self.heard = True

@@ -1,7 +1,7 @@
 """What the tests of the core share: matrices, exact sensors, a field, ways to drive."""
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 
 import numpy as np
 from hypothesis import strategies as st
@@ -112,8 +112,10 @@ def localizer(
     sensor: SensorSettings | None = None,
     odometry: OdometrySettings | None = None,
     collaboration: CollaborationSettings | None = None,
+    teammates: Collection[str] | None = None,
 ) -> Localizer:
-    """A localizer with defaults for all that a test does not speak about."""
+    """A localizer with defaults for all that a test does not speak about. `teammates`: all others
+    are guests; None: nobody is."""
     settings = LocalizationSettings(
         localizer=rules or LocalizerSettings(variant=variant),
         sensor=sensor or SensorSettings(),
@@ -121,7 +123,8 @@ def localizer(
         collaboration=collaboration or CollaborationSettings(),
         start=start or Start(x_m=0.0, y_m=0.0),
     )
-    return Localizer(settings, field)
+    team = None if teammates is None else frozenset(teammates)
+    return Localizer(settings, field, team)
 
 
 def state_at(pose: Pose2, covariance: Covariance3, stamp_ns: int = 0) -> State:

@@ -21,7 +21,8 @@ class Receiver:
         self.decisions: list[tuple[str, TrustDecision]] = []
 
     def receive(self, seconds: float, **all_nis: float) -> None:
-        """The senders' reports have these NIS (`own`: the robot's own sensors)."""
+        """The senders' reports have these NIS (`own`: the robot's own sensors; guests are named
+        so)."""
         for _ in range(round(10 * seconds)):
             self.now_ns += 100 * MS
             for name, nis in all_nis.items():
@@ -31,7 +32,9 @@ class Receiver:
                         self.senders, self.now_ns, 1 - bad, bad, self.rules.limit
                     )
                 else:
-                    self.report(name, TeammateReport(self.now_ns, nis, (0.5, 0.0)))
+                    is_guest = name.startswith("guest")
+                    report = TeammateReport(self.now_ns, nis, (0.5, 0.0), is_guest=is_guest)
+                    self.report(name, report)
 
     def report(self, name: str, report: TeammateReport) -> TrustDecision:
         decision = assess(self.senders, name, report, NEVER_NS, self.rules)

@@ -58,6 +58,7 @@ _MODULES = (
                 "declarations",
                 "filtering",
                 "frame_candidates",
+                "frame_claims",
                 "guests",
             ),
             *(

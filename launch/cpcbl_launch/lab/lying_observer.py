@@ -8,7 +8,7 @@ say nothing that their gates would reject.
 
 import math
 import random
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Final
 
 from msgspec.structs import replace
@@ -51,6 +51,10 @@ class LyingObserver:
         self._poses: dict[str, Pose] = {}
         if sends == "gated":
             self._pose_subscriber = Subscriber(bus, Pose, self._on_pose)
+
+    def leave(self) -> None:
+        """It is no longer there."""
+        self._token.close()
 
     def step(self, now_ns: int) -> None:
         """Sends what it says of the robots as they were when the truth was last published."""
@@ -96,6 +100,31 @@ class LyingObserver:
         part, turn = SIGMA_M**2, HEADING_SIGMA**2
         pose = truth.x_m, truth.y_m, truth.heading_rad
         return Belief(self._name, stamp_ns, *pose, (part, 0.0, part, 0.0, 0.0, turn))
+
+
+class RenamedLiar:
+    """A node of `run_nodes`: a lying guest that leaves again and again, and comes back under a name
+    that nobody has heard yet."""
+
+    def __init__(
+        self,
+        new_liar: Callable[[str], LyingObserver],
+        name: str,
+        every_s: float,
+    ) -> None:
+        """`new_liar`: the liar of this name."""
+        self.next_ns, self.waiting = 0, False
+        self._new_liar, self._name, self._every_ns = new_liar, name, round(every_s * 1e9)
+        self._liar, self._number = new_liar(name), 0
+
+    def step(self, now_ns: int) -> None:
+        number = now_ns // self._every_ns
+        if number != self._number:
+            self._number = number
+            self._liar.leave()
+            self._liar = self._new_liar(f"{self._name}.{number}")
+        self._liar.step(now_ns)
+        self.next_ns = self._liar.next_ns
 
 
 def _within_gate(fix: Fix, pose: Pose, covariance: tuple[Row3, Row3, Row3]) -> Fix:

@@ -17,7 +17,7 @@ from rich.console import RenderableType
 
 from cpcbl_launch.lab.experiments.trust_watch import TrustWatch
 from cpcbl_launch.lab.faulty_robot import Fault
-from cpcbl_launch.lab.lying_observer import LyingObserver
+from cpcbl_launch.lab.lying_observer import LyingObserver, RenamedLiar
 from cpcbl_launch.reporting.metrics import Score, score
 from cpcbl_launch.reporting.recorder import Recorder
 from cpcbl_launch.reporting.tables import number, table
@@ -30,6 +30,7 @@ from cpcbl_transport.memory_bus import MemoryHub
 
 HONEST = ("north", "south")
 ONE, TWO, GUEST = ("west",), ("west", "east"), ("ghost",)
+GUESTS = tuple(f"ghost{i}" for i in range(1, 6))
 DRIFT = "drift:0.01,0.0,0.01"  # 1 cm/s, and it states 1 cm
 ONE_AXIS = "one-axis:0.02,0.005,0.25"  # 2 cm/s in x, where it states 5 mm, and 25 cm in y
 LEAST_INSIDE = 0.95  # of the victim's samples within 3 sigma, where nobody can find the liars
@@ -48,13 +49,16 @@ class Attack(Struct, frozen=True, kw_only=True):
     """The aim, to the RMSE without liars; None: nobody can find out, and sigma has to hold."""
     sends: str = "fixes"
     bystanders: tuple[str, ...] = ()  # driving robots to which the liars report, too
+    honest: tuple[str, ...] = HONEST  # correct observers
+    renamed_every_s: float | None = None  # liars come back under another name so often
     from_s: float = 10.0
     end_s: float = 70.0
 
     @property
     def without(self) -> "Attack":
         """The same run without liars."""
-        return replace(self, name="", lie="", liars=(), sends="fixes", most_ratio=BLIND_RATIO)
+        none = {"name": "", "lie": "", "liars": (), "sends": "fixes", "renamed_every_s": None}
+        return replace(self, **none, most_ratio=BLIND_RATIO)
 
 
 class AttackRun(NamedTuple):
@@ -97,6 +101,14 @@ def attacks() -> tuple[Attack, ...]:
     cases += [replace(kind, liars=TWO, **NAVIGATOR) for kind in kinds]
     cases += [replace(drift, name="guest", liars=GUEST, **more) for more in ({}, NAVIGATOR)]
     cases += [replace(drift, name="no majority", liars=TWO, most_ratio=None)]
+    sudden = Attack(lie="overclaim:0.5,0.0,0.01")
+    renamed = Attack(lie="overclaim:0.25,0.0,0.005", renamed_every_s=4.0)
+    cases += [
+        replace(drift, name="five guests", liars=GUESTS),
+        replace(sudden, name="five guests at once", liars=GUESTS),
+        replace(renamed, name="guests with new names", liars=GUESTS),
+        replace(sudden, name="guests, one robot", liars=GUESTS, honest=("north",), most_ratio=None),
+    ]
     return tuple(replace(case, lie=case.lie.format(victim=case.victim)) for case in cases)
 
 
@@ -109,7 +121,7 @@ def attack_team(attack: Attack) -> Team:
     """The team of an attack: two correct observers, the driving robots, and the liars, whose posts
     are west and east of the field. A guest is no robot of the team."""
     team = load_team(builtin_path("liars"))
-    kept = {*HONEST, attack.victim, *attack.bystanders, *attack.liars}
+    kept = {*attack.honest, attack.victim, *attack.bystanders, *attack.liars}
     west = team.robots["west"]
     assert west.start is not None
     start = replace(west.start, x_m=9.0, heading_deg=180.0)
@@ -126,21 +138,32 @@ def run_attack(attack: Attack, seed: int) -> AttackRun:
     field = FieldNode(SimulatedField(team, seed, 0), hub.session())
     nodes = robot_nodes(team, hub, 0)
     correct = [n for name, n in zip(team.robots, nodes, strict=True) if name not in attack.liars]
-    told, sent = (attack.victim, *attack.bystanders), attack.sends
     fault = Fault.parse(f"{attack.lie}@{attack.from_s}-") if attack.lie else None
-    liars = [
-        LyingObserver(hub.session(), name, told, fault, seed, sent)
-        for name in attack.liars
-        if fault is not None
-    ]
+    liars = (
+        []
+        if fault is None
+        else [_lying_observer(attack, hub, fault, name, seed) for name in attack.liars]
+    )
     run_nodes([field, *correct, *liars], 0, int(attack.end_s * 1e9))
     truth = recorder.simulated_truth()[attack.victim]
     of_victim = score(recorder.samples(attack.victim, truth, attack.from_s))
     doubted_s = reported.doubted_s(attack.victim)
-    noticed_s = [at_s for name, at_s in doubted_s.items() if name in attack.liars]
+    noticed_s = [at_s for name, at_s in doubted_s.items() if name.split(".")[0] in attack.liars]
     after_s = min(noticed_s) - attack.from_s if noticed_s else None
     quarantined = {q.of for q in reported.quarantines if q.by == attack.victim}
-    return AttackRun(of_victim, after_s, len(quarantined & set(HONEST)))
+    return AttackRun(of_victim, after_s, len(quarantined & set(attack.honest)))
+
+
+def _lying_observer(
+    attack: Attack, hub: MemoryHub, fault: Fault, name: str, seed: int
+) -> LyingObserver | RenamedLiar:
+    told = attack.victim, *attack.bystanders
+
+    def new(name: str) -> LyingObserver:
+        return LyingObserver(hub.session(), name, told, fault, seed, attack.sends)
+
+    every_s = attack.renamed_every_s
+    return new(name) if every_s is None else RenamedLiar(new, name, every_s)
 
 
 # Over all seeds -----------------------------------------------------------------------------------
@@ -187,7 +210,8 @@ def attack_tables(rows: Sequence[AttackRow], seeds: int) -> Iterable[RenderableT
     yield shown
     yield (
         "A scout has one liar beside two correct observers, a navigator two (but one\n"
-        "guest); without a majority a scout has two. Column m is the median RMSE; worst\n"
+        "guest); without a majority a scout has two. Where guests lie there are five, once\n"
+        "beside one correct observer. Column m is the median RMSE; worst\n"
         "is the largest ratio of a seed to the same seed without liars. The aim is at most\n"
         f"{BLIND_RATIO:g} for a scout and {OWN_EYES_RATIO:g} for a navigator; "
         "without a majority σ has to hold.\n"
