@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 from cpcbl_team.arcs import with_arc_width
 from cpcbl_team.common_errors import CommonErrors
 from cpcbl_team.config import Field, Start
+from cpcbl_team.delayed_prior import DelayedPrior
 from cpcbl_team.estimate import HEADING, POSE, POSITION, ZERO3, Covariance3, Estimate, Scope
 from cpcbl_team.geometry import Pose2, new, wrap_angle
 from cpcbl_team.inputs import Belief, LandmarkBelief, Odometry, Sighting
@@ -142,6 +143,7 @@ class RecoveryMemory(NamedTuple):
     trusted: TrustedPose | None = None  # from before that, while it does
     mistake: str = ""  # of its driver, that explains what it rejects; it does not move meanwhile
     jump: Jump | None = None  # the latest
+    delayed: DelayedPrior | None = None  # while what it measures determines no pose
 
 
 class TeammateMemory(NamedTuple):
@@ -384,13 +386,8 @@ def with_records(
     until_ns: int,
 ) -> RecoveryMemory:
     """The recovery's memory with other evidence, and the sources of which no more is needed."""
-    lost, inflated_ns, relocated_ns, _, _, _, _, kidnapped_ns, suspected_ns, pose, mistake, jump = (
-        recovery
-    )
-    parts = (
-        lost, inflated_ns, relocated_ns, snapshots, evidence, recorded, until_ns,
-        kidnapped_ns, suspected_ns, pose, mistake, jump,
-    )  # fmt: skip
+    lost, inflated_ns, relocated_ns, _, _, _, _, *rest = recovery
+    parts = lost, inflated_ns, relocated_ns, snapshots, evidence, recorded, until_ns, *rest
     return new(RecoveryMemory, parts)
 
 
