@@ -148,6 +148,7 @@ class Adaptation(NamedTuple):
 
 
 AS_CONFIGURED: Final = Adaptation()
+LARGEST_SENSITIVITY: Final = 2e3  # in sigmas; where position and heading are apart it may diverge
 
 
 def after_path(
@@ -214,6 +215,8 @@ def check_models(check: ModelCheck, now: Corrected, noise: OdometryNoise) -> Mod
         taken.transformed(to_course),
         added.transformed(to_course),
     )
+    if any(abs(s) > LARGEST_SENSITIVITY for part in whitened for s in part[1:]):
+        return check.from_pose(now)
     evidence = check.evidence.plus(whitened)
     return check.with_block(now, difference(sensitivity, corrected), evidence)
 

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from support.core import (
     LOOP_START,
+    SECOND,
     diagonal,
     matrix3,
     state_at,
@@ -12,14 +13,17 @@ from support.core import (
 from cpcbl_team.config import (
     OdometryNoise,
 )
-from cpcbl_team.constant_errors import NO_ERRORS, Evidence, Whitened
-from cpcbl_team.estimate import Row
+from cpcbl_team.constant_errors import INSENSITIVE, NO_ERRORS, Evidence, Whitened
+from cpcbl_team.estimate import Estimate, Row
+from cpcbl_team.geometry import Pose2
 from cpcbl_team.miscalibration import (
     AS_CONFIGURED,
     Adaptation,
+    Corrected,
     ModelCheck,
     Rules,
     adapted,
+    check_models,
     doubts_of,
     noise_with_factor,
     percentages,
@@ -138,3 +142,19 @@ def test_noise_that_is_said_to_be_zero_can_be_widened() -> None:
     assert noise_with_factor(exact, 4.0).distance_sigma_m_per_sqrt_m == pytest.approx(0.02)
     assert percentages(Adaptation(motion_factor=4.0)) == {"odometry_sigma_percent": 200}
     assert percentages(AS_CONFIGURED) == {}
+
+
+@pytest.mark.parametrize("sensitivity_m", [1.0, 1e6])
+def test_a_sensitivity_that_has_diverged_begins_anew(sensitivity_m: float) -> None:
+    """That of a robot that keeps position and heading apart grew without end: the sums were lost in
+    rounding, and the square root of a negative variance ended the robot."""
+    before = Corrected(0, Estimate(Pose2(0.0, 0.0, 0.0), diagonal(0.1, 0.1)), Pose2(0, 0, 0), 0)
+    after = Estimate(Pose2(1.0, 0.0, 0.0), diagonal(0.05, 0.05))
+    now = Corrected(2 * SECOND, after, Pose2(1.0, 0.0, 0.0), 0)
+    sensitivity = (sensitivity_m, 0.1, 0.1, 0.1, sensitivity_m, 0.1, 0.1, 0.1, 0.1)
+    check = ModelCheck(before, sensitivity)
+    found = check_models(check, now, OdometryNoise())
+    has_diverged = sensitivity_m > 1.0
+    assert (found.sensitivity == INSENSITIVE) is has_diverged
+    assert (found.evidence == Evidence()) is has_diverged
+    found.evidence.fit()
