@@ -63,10 +63,32 @@ def misplaced_objects(
         if v.is_clear
         and sum(readings_of(e) for e in right if e.stamp_ns > v.since_ns) >= READINGS * len(wrong)
     }
-    if not found and len(wrong) == 2:
-        a, b = wrong.values()
-        found = set(wrong) if _are_exchanged(a, b, chi_square) else found
     return frozenset(found)
+
+
+def exchanged_objects(
+    known: Estimate,
+    evidence: Sequence[Evidence],
+    odometry_from_robot: Pose2,
+    names: Collection[str],
+) -> frozenset[str]:
+    """The two objects of the map that stand where the other one is, if nothing else contradicts the
+    pose `known`; empty if there are none. `evidence`: its latest, in order of time."""
+
+    def chi_square(e: Evidence) -> float:
+        return _chi_square(known, e, odometry_from_robot)
+
+    own = [e for e in evidence if not e.from_teammate and e.source in names]
+    wrong = {n: v.pieces for n, v in _agreements(own, chi_square).items() if v.contradicts}
+    if len(wrong) != 2 or sum(map(len, wrong.values())) < LEAST_CONTRADICTIONS:
+        return frozenset()
+    a, b = wrong.values()
+    for pieces, other in ((a, b[0]), (b, a[0])):
+        there = [e._replace(x=other.x, y=other.y) for e in pieces]
+        agreeing = [e for e in there if readings_of(e) > 1 and chi_square(e) < AGREEMENT]
+        if 2 * len(agreeing) <= len(there):
+            return frozenset()
+    return frozenset(wrong)
 
 
 def explains_as_well(
@@ -117,18 +139,6 @@ def _alike(judged: Sequence[tuple[Evidence, float]]) -> Sequence[Evidence]:
     return [e for e, _ in alike][::-1]
 
 
-def _are_exchanged(a: _Agreement, b: _Agreement, chi_square: Callable[[Evidence], float]) -> bool:
-    """Whether each of two objects is where the other one is on the map."""
-    if not (a.is_clear and b.is_clear):
-        return False
-    for pieces, other in ((a.pieces, b.pieces[0]), (b.pieces, a.pieces[0])):
-        there = [e._replace(x=other.x, y=other.y) for e in pieces]
-        agreeing = [e for e in there if readings_of(e) > 1 and chi_square(e) < AGREEMENT]
-        if 2 * len(agreeing) <= len(there):
-            return False
-    return True
-
-
 def kept_at_trusted_pose(
     state: State,
     memory: RecoveryMemory,
@@ -150,11 +160,12 @@ def kept_at_trusted_pose(
     xx, _, yy, _, _, hh = known.covariance
     if 0.5 * (xx + yy) > KNOWN_M**2 or hh > KNOWN_RAD**2:
         return None
-    misplaced = misplaced_objects(known, evidence, place, names)
+    exchanged = exchanged_objects(known, evidence, place, names)
+    misplaced = exchanged or misplaced_objects(known, evidence, place, names)
     unused = misplaced | memory.unused_objects(state.stamp_ns)
     if 2 * len(unused) > len(names):
         return None
-    if misplaced and explaining_mistake(state, memory, evidence, None):
+    if misplaced and not exchanged and explaining_mistake(state, memory, evidence, None):
         return None  # nothing can be said of objects before the driver is mended
     if not misplaced:
         latest = [e for e in evidence if e.stamp_ns >= state.stamp_ns - LATEST_NS]

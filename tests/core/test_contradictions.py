@@ -10,6 +10,7 @@ from cpcbl_team.config import LocalizationSettings
 from cpcbl_team.contradictions import (
     UNUSED_NS,
     contradicts,
+    exchanged_objects,
     explains_as_well,
     kept_at_trusted_pose,
     misplaced_objects,
@@ -86,11 +87,14 @@ def test_bearings_alone_need_two_that_agree() -> None:
 
 
 def test_two_that_stand_where_the_other_is_on_the_map_are_exchanged() -> None:
-    places = MAP | {"a": MAP["b"], "b": MAP["a"]}
-    wrong = [seen(name, at_s, places=places) for at_s in (1.0, 1.5, 2.0) for name in "ab"]
-    assert misplaced(*wrong) == {"a", "b"}
+    places, still = MAP | {"a": MAP["b"], "b": MAP["a"]}, Pose2(0.0, 0.0, 0.0)
+    wrong = [seen(name, at_s, places=places) for at_s in (1.0, 1.5) for name in "ab"]
+    assert exchanged_objects(KNOWN, wrong, still, MAP) == {"a", "b"}
+    assert exchanged_objects(KNOWN, wrong[:2], still, MAP) == frozenset()  # too few
+    with_third = [*wrong, seen("c", 2.0, ELSEWHERE)]
+    assert exchanged_objects(KNOWN, with_third, still, MAP) == frozenset()
     turned = [seen(e.source, e.stamp_ns / S, ELSEWHERE) for e in wrong]  # the robot is elsewhere
-    assert misplaced(*turned) == frozenset()
+    assert exchanged_objects(KNOWN, turned, still, MAP) == frozenset()
 
 
 @pytest.mark.parametrize(
