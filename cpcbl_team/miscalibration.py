@@ -247,10 +247,8 @@ def adapted(
     due = LEAST_REJECTED + MOST_DUE * (1.0 - rules.gate_probability)
     is_rejecting = check.rejections > max(due * all_of_them, LEAST_REJECTIONS)
     scatter, parts = fit.scatter, rules.independent_share * evidence.parts
-    if rules.knows_covariance:
-        # Where sigmas are too small, what is accepted scatters more than is due. Else what is
-        # rejected are outliers (names that were misread), and no sigma explains these
-        is_rejecting &= scatter > 1.0
+    if rules.knows_covariance:  # what is accepted scatters more where sigmas are too small; else
+        is_rejecting &= scatter > 1.0  # what is rejected are outliers, such as misread names
     least_lag = REJECTING_LAG if is_rejecting else MOTION_LAG
     of_motion = evidence.lagged > least_lag * scatter * evidence.parts
     if not rules.knows_covariance:
