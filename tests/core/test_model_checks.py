@@ -125,12 +125,14 @@ def test_doubts_widen_what_is_reported_and_not_what_is_estimated() -> None:
 
 
 def test_a_persistent_share_of_rejections_widens_too() -> None:
-    check = scattered(1.0, alternating=True)._replace(rejections=20)
+    check = scattered(1.1, alternating=True)._replace(rejections=20)
     assert adapted(check, AS_CONFIGURED, 2000, Rules(0.999)) is None  # 1.0 %
     found = adapted(check, AS_CONFIGURED, 980, Rules(0.999))  # 2.0 %
     assert found is not None
     assert found.sensor_factor > 1.5
     assert adapted(check, AS_CONFIGURED, 980, Rules(0.99)) is None  # here 1 % is due
+    outliers = scattered(0.9, alternating=True)._replace(rejections=20)
+    assert adapted(outliers, AS_CONFIGURED, 980, Rules(0.999)) is None
 
 
 def test_noise_that_is_said_to_be_zero_can_be_widened() -> None:

@@ -50,8 +50,8 @@ BUGS = {
     "fresh budget": Bug(
         robot.Robot,
         "__init__",
-        "match = team.messages_per_s(name), restarted,",
-        "match = team.messages_per_s(name), False,",
+        "restarted=restarted,\n                match_s",
+        "restarted=False,\n                match_s",
     ),
     "free beliefs": Bug(
         collaboration.CollaborationAgent,
