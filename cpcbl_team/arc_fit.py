@@ -7,7 +7,6 @@ starts. Where another pose fits nearly as well there is no best one.
 
 import math
 from collections.abc import Callable
-from itertools import product
 from typing import Final, NamedTuple
 
 from cpcbl_team.arcs import Arc
@@ -33,10 +32,6 @@ HALVINGS: Final = 6  # of a step that makes the fit worse
 LEAST_GAIN: Final = 1e-4  # of the chi-square, by a step
 STARTS = (-2.0, -1.0, 1.0, 2.0)  # sigmas of the turn,
 SIDE_STARTS = (-1.5, 1.5)  # and of the offset along each axis, besides the mean
-GRID_RAD: Final = math.radians(36.0)  # between starts anywhere on the arc, at most,
-GRID_SIDES: Final = (-1.5, 0.0, 1.5)  # and aside of it, in sigmas
-MOST_TURN: Final = 2.5  # sigmas
-MOST_STARTS: Final = 10
 SMALL_SHARE: Final = 1.0 / 16.0  # of the prior's determinant: much was uncertain
 LIKELY: Final = 2.0  # the chi-square a scalar of a fit beside which no other one is looked for
 APART: Final = 16.27  # the chi-square of another pose (99.9 %, three degrees of freedom)
@@ -59,18 +54,7 @@ def best_fit(arc: Arc, measure: Measure) -> ArcFit | None:
     is_small_step = first.covariance.determinant() > SMALL_SHARE * arc.covariance.determinant()
     if is_small_step and first.cost < LIKELY * (1 + first.measured):
         return first
-    return unrivalled([first, *(_fit(arc, start, measure) for start in _other_starts(arc))])
-
-
-def fits_anywhere(arc: Arc, measure: Measure) -> list[ArcFit]:
-    """The fits where much is measured by a robot that knows little: they begin wherever the prior
-    allows it."""
-    starts = [(0.0, 0.0, 0.0), *_spread_starts(arc, measure)]
-    return [_fit(arc, start, measure) for start in starts]
-
-
-def unrivalled(fits: list[ArcFit]) -> ArcFit | None:
-    """The best of these fits; None if another one that is apart is nearly as good."""
+    fits = [first, *(_fit(arc, start, measure) for start in _other_starts(arc))]
     most = max(fit.measured for fit in fits)
     fits = [fit for fit in fits if fit.measured == most]
     best = min(fits, key=lambda fit: fit.cost)
@@ -95,34 +79,6 @@ def _other_starts(arc: Arc) -> list[Row]:
     starts = [(0.0, 0.0, k * turn) for k in STARTS]
     starts += [(k * x, 0.0, 0.0) for k in SIDE_STARTS]
     return starts + [(0.0, k * y, 0.0) for k in SIDE_STARTS]
-
-
-def _spread_starts(arc: Arc, measure: Measure) -> list[Row]:
-    """The best starts of a grid: first those that are better than all beside them."""
-    xx, _, yy, _, _, hh = arc.covariance
-    most, x, y = min(MOST_TURN * math.sqrt(hh), math.pi), math.sqrt(xx), math.sqrt(yy)
-    half = math.ceil(most / GRID_RAD)
-    grid = {
-        (i, j, k): (a * x, b * y, most * k / half)
-        for i, a in enumerate(GRID_SIDES)
-        for j, b in enumerate(GRID_SIDES)
-        for k in range(-half, half + 1)
-    }
-    costs = {cell: _cost_at(arc, start, measure) for cell, start in grid.items()}
-
-    def is_beside_better(cell: tuple[int, int, int]) -> bool:
-        i, j, k = cell
-        beside = product((i - 1, i, i + 1), (j - 1, j, j + 1), (k - 1, k, k + 1))
-        return any(costs.get(other, math.inf) < costs[cell] for other in beside)
-
-    best_first = sorted(grid, key=lambda cell: (is_beside_better(cell), costs[cell]))
-    return [grid[cell] for cell in best_first[:MOST_STARTS]]
-
-
-def _cost_at(arc: Arc, offset: Row, measure: Measure) -> float:
-    """The chi-square of prior and measurements at an offset."""
-    scalars = measure(arc.at(offset))
-    return arc.cost(offset) + sum(e * e / sharpest(variance) for _, e, variance in scalars)
 
 
 def _fit(arc: Arc, offset: Row, measure: Measure) -> ArcFit:

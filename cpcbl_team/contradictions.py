@@ -12,8 +12,7 @@ from typing import Final, NamedTuple
 
 from cpcbl_team.estimate import Estimate, FilteredOffset
 from cpcbl_team.geometry import Pose2
-from cpcbl_team.propagated_evidence import PropagatedEvidence, readings_of
-from cpcbl_team.relocalization import OUTLIER
+from cpcbl_team.relocalization import OUTLIER, PropagatedEvidence, readings_of
 from cpcbl_team.state import Evidence, RecoveryMemory, State
 from cpcbl_team.trusted_pose import LATEST_NS, agrees, explaining_mistake, propagated_pose
 

@@ -4,7 +4,6 @@ from collections.abc import Iterable
 
 from cpcbl_team.config import LocalizationSettings
 from cpcbl_team.constraints import Constraint
-from cpcbl_team.delayed_update import with_delay, without_delay
 from cpcbl_team.estimate import Estimate, Scope
 from cpcbl_team.measurements import (
     GatedObjects,
@@ -17,7 +16,7 @@ from cpcbl_team.relinearization import Linearization, Relinearization
 from cpcbl_team.state import State
 
 AMBIGUOUS = "ambiguous"
-"""Counted when what a robot with an uncertain heading measures determines no pose."""
+"""Counted when two poses agree with what a robot with an uncertain heading measures."""
 
 
 class Gate:
@@ -38,16 +37,13 @@ class Gate:
         self, state: State, measurements: Iterable[Measurement], scope: Scope
     ) -> tuple[State, GatedObjects]:
         """The constraints of each object, accepted or rejected by the chi-square bound of their
-        innovation, and the state about whose estimate they are linear. Where what a robot with an
-        uncertain heading measures determines no pose, no object of the map is used."""
+        innovation, and the state about whose estimate they are linear. Where two poses agree with
+        what a robot with an uncertain heading measures, no object of the map is used."""
         measured = sorted(measurements, key=lambda m: m.source)
         found = self._relinearization.about_best_pose(state, measured)
         if found is None:
             of_teammates = [m for m in measured if m.sender]
-            state = with_delay(state.counted(AMBIGUOUS))
-            return state, self._gated(state, of_teammates, scope, None)
-        if any(not m.sender for m in measured):
-            state, found = without_delay(state), (without_delay(found[0]), found[1])
+            return state.counted(AMBIGUOUS), self._gated(state, of_teammates, scope, None)
         after, about = found
         gated = self._gated(after, measured, scope, about)
         if about is None or gated.accepted:

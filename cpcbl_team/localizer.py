@@ -48,7 +48,7 @@ from cpcbl_team.recovery_evidence import (
     with_measurements,
     with_snapshot,
 )
-from cpcbl_team.relinearization import Relinearization, is_wide
+from cpcbl_team.relinearization import Relinearization
 from cpcbl_team.sensors import sighting_fault
 from cpcbl_team.state import (
     LandmarkSnapshot,
@@ -179,13 +179,11 @@ class Localizer:
 
     def _update_order(self, state: State) -> UpdateOrder:
         """The parts of the pose that may be updated now, first the one that waits longer; each
-        type has its timer. The last is None: nothing. Along an arc both are one."""
+        type has its timer. The last is None: nothing."""
         updates = state.updates
         if state.has_no_heading:
             return (None,)
         order = self._variant.update_orders[updates.heading_is_latest]
-        if self._relinearization.is_due(state):
-            order = (POSE, None)
         least = self._minimum_interval_ns
         if least > 0.0:
             now = state.stamp_ns
@@ -203,7 +201,6 @@ class Localizer:
         mates, believed = state.memory.teammates, self.landmark_beliefs.usable(state)
         measured: list[Measurement] = []
         faults: list[str] = []
-        is_vague = is_wide(state) and self._relinearization.is_due(state)
         calibration = state.memory.calibration
         bias, adaptation = calibration.bearing_bias_rad, calibration.adaptation
         factor, is_wrong = adaptation.sensor_factor, bias != 0.0 or any(adaptation.ranges)
@@ -219,7 +216,7 @@ class Localizer:
                 if sighting.id not in believed and self._common.has_no_place(state, sighting.id):
                     state = self._common.with_reading(state, sighting, now_ns)
                     continue
-            known = mates.beliefs, self.settings, state.common_errors, believed, is_vague
+            known = mates.beliefs, self.settings, state.common_errors, believed
             m = measurement_of(sighting, now_ns, state.estimate.pose, self.field, *known)
             if m is not None:
                 m = m.corrected(bias, adaptation.ranges) if is_wrong else m

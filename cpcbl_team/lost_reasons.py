@@ -6,8 +6,7 @@ from typing import NamedTuple
 
 from cpcbl_team.config import LocalizerSettings
 from cpcbl_team.estimate import Estimate
-from cpcbl_team.propagated_evidence import readings_of
-from cpcbl_team.relocalization import UNKNOWNS
+from cpcbl_team.relocalization import UNKNOWNS, readings_of
 from cpcbl_team.state import Evidence
 
 

@@ -163,11 +163,9 @@ def measurement_of(
     settings: config.LocalizationSettings,
     common: CommonErrors | None = None,
     landmark_beliefs: Mapping[str, LandmarkBelief] = NO_BELIEFS,
-    is_vague: bool = False,
 ) -> Measurement | None:
     """The sighting, from about `pose`, with its object's position; None if that is not known.
-    `landmark_beliefs`: as of `map_object`. `is_vague`: the pose may be so wrong that a range to be
-    expected from there makes no sigma smaller than the reading does."""
+    `landmark_beliefs`: as of `map_object`."""
     name, is_for_heading, wall, gives = sighting.id, False, None, "both"
     on_map, sender = map_object(field, name, common, landmark_beliefs), name
     if on_map is not None:
@@ -187,10 +185,7 @@ def measurement_of(
         range_m = None
     if gives == "range" or gives == "none":
         bearing = None
-    expected_m = _expected_range(pose, position, wall)
-    if is_vague and range_m is not None:
-        expected_m = max(expected_m, range_m)
-    sigmas = sighting_sigmas(sighting, sensor, expected_m)
+    sigmas = sighting_sigmas(sighting, sensor, _expected_range(pose, position, wall))
     read = range_m, bearing, *sigmas
     is_estimated = common is not None and name in common.objects and not sender
     about = on_map is None, *read, is_for_heading, is_estimated, sender

@@ -6,13 +6,10 @@ what it measures, it inflates its covariance step by step until its gates open.
 """
 
 from collections.abc import Callable, Sequence
-from operator import attrgetter
 from typing import Final
 
-from cpcbl_team.config import Field, LocalizationSettings, OdometryNoise
+from cpcbl_team.config import Field, LocalizationSettings
 from cpcbl_team.contradictions import contradicts, kept_at_trusted_pose
-from cpcbl_team.delayed_prior import DelayedPrior, PropagatedPrior
-from cpcbl_team.delayed_update import attempt, is_due
 from cpcbl_team.estimate import Estimate
 from cpcbl_team.inflation import inflate_covariance, inflate_to
 from cpcbl_team.initial_pose import estimate_of
@@ -83,9 +80,6 @@ class Recovery:
         """The state, marked as lost or not. A lost robot is found again from recent evidence, or
         else inflates its covariance from time to time."""
         memory = state.memory.recovery
-        if memory.delayed is not None and is_due(memory, memory.delayed):
-            state = self._with_delayed_update(state, memory.delayed)
-            memory = state.memory.recovery
         limits = self._limits_when_lost if memory.lost else self._limits
         reason = lost_reason(state.estimate, state.updates.innovations, limits)
         if memory.kidnapped_ns >= 0 and not reason:
@@ -98,15 +92,6 @@ class Recovery:
         if memory.suspected_ns < 0 and not rejected_of(state.updates.innovations)[0]:
             return state
         return self._questioned(state)
-
-    def _with_delayed_update(self, state: State, prior: DelayedPrior) -> State:
-        """The state of a robot whose prior waits for evidence, with what that determines."""
-        evidence = self._evidence_since(state, prior.stamp_ns - 1)  # that of its time is not in it
-        state, found = attempt(state, evidence, self._field, self._odometry_noise(state))
-        if found is None:
-            return state
-        memory, senders = state.memory.recovery, state.memory.teammates.senders
-        return self._begun_anew(state, found, memory, reset_scores(senders))
 
     def _questioned(self, state: State) -> State:
         """The state of a robot that is not lost, but rejects more than it should, or did lately. It
@@ -231,7 +216,7 @@ class Recovery:
     def _found(self, state: State, estimate: Estimate, recovery: RecoveryMemory) -> State:
         """The state of a robot that is found again."""
         recovery = with_jump(state, recovery, estimate.pose)._replace(
-            lost="", kidnapped_ns=-1, suspected_ns=-1, delayed=None
+            lost="", kidnapped_ns=-1, suspected_ns=-1
         )
         senders = reset_scores(state.memory.teammates.senders)
         state = state.counted("found_again")
@@ -273,10 +258,12 @@ class Recovery:
         """All the evidence in a memory, the latest last: of landmarks as the robot would measure
         them with this adaptation."""
         of_landmarks = self._landmarks.evidence_of
-        pieces = [piece for s in memory.snapshots for piece in of_landmarks(s, adaptation)]
-        pieces = sorted((*pieces, *memory.evidence), key=attrgetter("stamp_ns"))
-        if memory.misplaced and pieces:
-            unused = memory.unused_objects(pieces[-1].stamp_ns)
+        pieces: Sequence[Evidence] = [
+            piece for s in memory.snapshots for piece in of_landmarks(s, adaptation)
+        ]
+        pieces = sorted((*pieces, *memory.evidence), key=_stamp)
+        if memory.misplaced:
+            unused = memory.unused_objects(pieces[-1].stamp_ns) if pieces else frozenset()
             pieces = [e for e in pieces if e.source not in unused]
         return latest(tuple(pieces))
 
@@ -334,14 +321,11 @@ class Recovery:
         return self._begun_anew(state.counted("found_again"), estimate, recovery, senders)
 
     def _relocalized(self, state: State, evidence: tuple[Evidence, ...]) -> Estimate | None:
-        """The pose that evidence determines; none that a prior that waits for it excludes."""
-        place, prior = state.odometry_from_robot, state.memory.recovery.delayed
-        found = relocalize(evidence, place, self._field, self._odometry_noise(state))
-        if found is None or prior is None or PropagatedPrior(prior, place).allows(found.pose):
-            return found
-        return None
-
-    def _odometry_noise(self, state: State) -> OdometryNoise:
-        """The odometry as noisy as the robot found it to be."""
+        """The pose that evidence determines, by odometry as noisy as the robot found it to be."""
         factor = state.memory.calibration.adaptation.motion_factor
-        return noise_with_factor(self._noise, factor)
+        noise = noise_with_factor(self._noise, factor)
+        return relocalize(evidence, state.odometry_from_robot, self._field, noise)
+
+
+def _stamp(piece: Evidence) -> int:
+    return piece.stamp_ns

@@ -6,7 +6,6 @@ from collections.abc import Collection, Sequence
 from typing import Final, TypeVar
 
 from cpcbl_team.fixes import PoseObservation
-from cpcbl_team.geometry import new
 from cpcbl_team.measurements import Measurement
 from cpcbl_team.state import (
     FIX,
@@ -14,6 +13,7 @@ from cpcbl_team.state import (
     LandmarkSnapshot,
     RecoveryMemory,
     State,
+    with_records,
 )
 
 WINDOW_NS: Final = 20_000_000_000
@@ -49,7 +49,7 @@ def with_snapshot(memory: RecoveryMemory, snapshot: LandmarkSnapshot) -> Recover
     for sighting in snapshot.sightings:
         recent[sighting.id] = now
     snapshots = latest((*memory.snapshots, snapshot))
-    return _with_records(memory, snapshots, memory.evidence, frozenset(recent), until_ns)
+    return with_records(memory, snapshots, memory.evidence, frozenset(recent), until_ns)
 
 
 def with_evidence(memory: RecoveryMemory, pieces: Sequence[Evidence]) -> RecoveryMemory:
@@ -65,7 +65,7 @@ def with_evidence(memory: RecoveryMemory, pieces: Sequence[Evidence]) -> Recover
         return memory
     until_ns = min(recent.values()) + SPACING_NS
     evidence = latest((*memory.evidence, *new))
-    return _with_records(memory, memory.snapshots, evidence, frozenset(recent), until_ns)
+    return with_records(memory, memory.snapshots, evidence, frozenset(recent), until_ns)
 
 
 def with_measurements(state: State, measurements: Sequence[Measurement]) -> RecoveryMemory:
@@ -99,7 +99,7 @@ def without_senders(memory: RecoveryMemory, senders: Collection[str]) -> Recover
 def without_evidence(memory: RecoveryMemory) -> RecoveryMemory:
     """The memory of a robot that drove nobody knows where: dead reckoning does not lead from older
     evidence to its present pose."""
-    return _with_records(memory, (), (), frozenset(), 0)
+    return with_records(memory, (), (), frozenset(), 0)
 
 
 def latest(stamped: tuple[Stamped, ...]) -> tuple[Stamped, ...]:
@@ -130,16 +130,3 @@ def recently_recorded(memory: RecoveryMemory, now_ns: int) -> frozenset[str]:
     if now_ns < memory.recorded_until_ns:
         return memory.recorded
     return frozenset(_recent(memory, now_ns))
-
-
-def _with_records(
-    recovery: RecoveryMemory,
-    snapshots: tuple[LandmarkSnapshot, ...],
-    evidence: tuple[Evidence, ...],
-    recorded: frozenset[str],
-    until_ns: int,
-) -> RecoveryMemory:
-    """The recovery's memory with other evidence, and the sources of which no more is needed."""
-    lost, inflated_ns, relocated_ns, _, _, _, _, *rest = recovery
-    parts = lost, inflated_ns, relocated_ns, snapshots, evidence, recorded, until_ns, *rest
-    return new(RecoveryMemory, parts)

@@ -20,11 +20,6 @@ from cpcbl_team.measurements import Measurement, constraints_of
 from cpcbl_team.state import State, with_common_errors
 
 BENT_VARIANCE: Final = math.radians(5.0) ** 2  # of the heading: above, tangents are no arcs
-WIDE_VARIANCE: Final = math.radians(12.0) ** 2
-"""Of the heading: above, single readings that leave no arc are not used until they determine a pose
-together (`delayed_update.py`)."""
-MOST_BENT_VARIANCE: Final = math.radians(25.0) ** 2  # above, single readings leave none
-KNOWN: Final = 0.04  # of the squared distance of an object: the variance of a position
 NEARLY_KNOWN: Final = 0.2
 """The ratio of the offset's variance to what the turn adds to that of the position, and to the
 squared distance of an object, below which no more than the turn is uncertain."""
@@ -111,32 +106,26 @@ class Relinearization:
         """`gates`: chi-square bounds of one and of two constraints. `common`: the errors that
         depend on those of the pose."""
         self._rules, self._gates, self._common = settings.localizer, gates, common
-        self._moves = settings.odometry.moves  # else ranges would never determine the heading
 
     def is_due(self, state: State) -> bool:
         """Whether the estimate is a Gaussian along an arc only. (That of a robot that rejects what
         it measures is a doubt, and no arc.)"""
         memory = state.memory.recovery
         is_doubt = memory.suspected_ns >= 0 or memory.kidnapped_ns >= 0
-        is_bent = self._rules.follows_arcs and state.estimate.covariance.hh > BENT_VARIANCE
+        is_bent = self._rules.estimates_whole_pose and state.estimate.covariance.hh > BENT_VARIANCE
         return is_bent and not is_doubt
 
     def about_best_pose(
         self, state: State, measurements: Iterable[Measurement]
     ) -> tuple[State, Linearization | None] | None:
         """The state with its prior about the pose that fits the objects of the map best, and that
-        pose; None if another pose fits nearly as well, or so little is known that they leave no
-        arc. The state as it is, and no pose, where its estimate is no arc, or they leave none
-        beside a heading that is known better."""
+        pose; None if another pose fits nearly as well. The state as it is, and no pose, where its
+        estimate is no arc, or these objects leave none."""
         if not self.is_due(state):
             return state, None
         arc, objects = Arc.of(state.estimate), [m for m in measurements if not m.sender]
-        if not objects:
+        if not objects or not all(_leaves_arc(arc, m) for m in objects):
             return state, None
-        if not all(_leaves_arc(arc, m) for m in objects):
-            is_evidence = self._moves and any(m.wall is None for m in objects)
-            waits = is_evidence and is_wide(state) and not all(_is_known(arc, m) for m in objects)
-            return None if waits else (state, None)
         accepted: list[Measure] = []
         for m in objects:
             measure = self._measure(state, m)
@@ -163,42 +152,16 @@ class Relinearization:
         return measure
 
 
-def is_wide(state: State) -> bool:
-    """Whether so little is known of the heading that single readings may lead to a wrong pose."""
-    return state.estimate.covariance.hh > WIDE_VARIANCE
-
-
 def _leaves_arc(arc: Arc, m: Measurement) -> bool:
     """Whether what an object says leaves a pose on an arc. Range and bearing to one point leave
     nothing but a turn about it undetermined, whatever the prior is; other ones leave other curves
-    where more than the turn is uncertain, or that very much."""
+    where more than the turn is uncertain."""
     if m.range_m is not None and m.bearing is not None and m.wall is None:
         return True
     xx, _, yy, _, _, hh = arc.covariance
-    apart, by_turn = xx + yy, _variance_by_turn(arc)
-    is_bent = hh <= MOST_BENT_VARIANCE
-    return is_bent and apart <= NEARLY_KNOWN * min(_squared_distance(arc, m), by_turn)
-
-
-def _is_known(arc: Arc, m: Measurement) -> bool:
-    """Whether the position is known so well, beside the distance of an object, that what it says is
-    linear; of a range, also that it tells nothing of the turn."""
-    xx, _, yy, _, _, _ = arc.covariance
-    by_turn = _variance_by_turn(arc)
-    if m.range_m is not None and by_turn > m.range_sigma * m.range_sigma:
-        return False
-    return xx + yy + by_turn <= KNOWN * _squared_distance(arc, m)
-
-
-def _variance_by_turn(arc: Arc) -> float:
-    """What the turn adds to the variance (m^2) of the position."""
-    return arc.covariance.hh * (arc.x * arc.x + arc.y * arc.y)
-
-
-def _squared_distance(arc: Arc, m: Measurement) -> float:
-    """From the mean to an object, m^2."""
+    apart, by_turn = xx + yy, hh * (arc.x * arc.x + arc.y * arc.y)
     dx, dy = m.position.x - arc.pose.x, m.position.y - arc.pose.y
-    return dx * dx + dy * dy
+    return apart <= NEARLY_KNOWN * min(dx * dx + dy * dy, by_turn)
 
 
 def _about(state: State, arc: Arc, offset: Row) -> State:

@@ -8,13 +8,15 @@ errs between two pieces is in all that are older.
 """
 
 import math
+from collections import Counter
 from collections.abc import Iterator
 from typing import NamedTuple
 
 from cpcbl_team.config import Field, OdometryNoise
-from cpcbl_team.delayed_prior import PropagatedPrior
+from cpcbl_team.constraints import Constraint, bearing_heading, range_circle
 from cpcbl_team.estimate import (
     POSE,
+    SMALLEST_VARIANCE,
     ZERO3,
     Covariance3,
     Estimate,
@@ -26,8 +28,7 @@ from cpcbl_team.estimate import (
 )
 from cpcbl_team.fusion import chi_square_bound
 from cpcbl_team.geometry import Pose2, wrap_angle
-from cpcbl_team.motion import motion_noise
-from cpcbl_team.propagated_evidence import PropagatedEvidence, propagated, readings_of
+from cpcbl_team.motion import drift_sigmas, motion_noise
 from cpcbl_team.state import Evidence
 
 DRIFT_FACTOR = 1.0  # on the variance of the odometry's noise
@@ -42,6 +43,7 @@ FAR = 32.0  # which counts as this at most
 UNKNOWNS = 3  # of a pose
 _OPEN = Covariance3(1e6, 0.0, 1e6, 0.0, 0.0, 1e3)
 _STEP = Covariance3(9.0, 0.0, 9.0, 0.0, 0.0, 1.0)  # how far one iteration of a fit may lead
+_SHARPEST = 1e-6  # (1 mm)^2, (1 mrad)^2: sharper evidence drowns _OPEN in rounding
 _ENOUGH_POSITION_SIGMA_M = 0.7
 _ENOUGH_HEADING_SIGMA_RAD = 0.5
 
@@ -65,9 +67,16 @@ def relocalize(
     headed = sum(e.heading_rad is not None for e in evidence)
     if not headed and len({(e.x, e.y) for e in evidence}) < 2:
         return None
-    if sum(readings_of(e) for e in evidence) <= UNKNOWNS:
+    repeated = sum(e.from_teammate for e in evidence) + headed
+    uses = Counter(e.source for e in evidence if e.source in field.landmarks)
+    own = [e for e in evidence if e.source in field.unsurveyed and not e.from_teammate]
+    uses |= Counter({e.source: len(own) for e in own})
+    pieces = [
+        PropagatedEvidence(e, odometry_from_robot, repeated if e.from_teammate else uses[e.source])
+        for e in evidence
+    ]
+    if sum(readings_of(e) for e in evidence) < 4:
         return None
-    pieces = propagated(evidence, odometry_from_robot, field)
     fits = [_fit(start, pieces) for start in _spread_starts(pieces, field)]
     found = sorted((f for f in fits if f is not None), key=lambda f: f.cost)
     if not found:
@@ -75,25 +84,94 @@ def relocalize(
     best = found[0]
     if any(f.cost < best.cost + RIVAL and are_apart(f.pose, best.pose) for f in found[1:]):
         return None
-    return checked_estimate(best, noise)
-
-
-def checked_estimate(best: "Fit", noise: OdometryNoise) -> Estimate | None:
-    """The estimate by the best fit, with the drift between its pieces; None if they determine no
-    pose, or do not agree."""
     cost, estimate = _with_drift(best, noise)
-    freedom = sum(readings_of(piece.evidence) for piece in best.used)
-    freedom -= UNKNOWNS if best.prior is None else 0
+    freedom = sum(readings_of(piece.evidence) for piece in best.used) - 3
     if freedom < 1 or not _is_certain(estimate) or cost > chi_square_bound(freedom):
         return None
-    widened = _wider_covariance(cost, estimate, best, noise)
+    widened = _wider_covariance(cost, estimate, best.used, noise)
     if widened is None or not _is_certain(estimate._replace(covariance=widened)):
         return None
     covariance = widened.scaled(max(1.0, cost / freedom))
-    is_shared = any(
-        p.evidence.from_teammate or p.evidence.heading_rad is not None for p in best.used
-    )
-    return Estimate(estimate.pose, covariance, covariance if is_shared else ZERO3)
+    return Estimate(estimate.pose, covariance, covariance if repeated else ZERO3)
+
+
+def readings_of(e: Evidence) -> int:
+    """How many numbers a piece of evidence says: a position is two."""
+    if e.range_m is None and e.bearing_rad is None:
+        return 2 + (e.heading_rad is not None)
+    return (e.range_m is not None) + (e.bearing_rad is not None)
+
+
+class PropagatedEvidence:
+    """A piece of evidence that dead reckoning has brought to the present."""
+
+    def __init__(self, evidence: Evidence, odometry_from_robot: Pose2, repeated: int) -> None:
+        """`repeated`: how many pieces may have the same error of a teammate, or of a place."""
+        self.evidence = evidence
+        self.now_from_then = odometry_from_robot.inverse() @ evidence.odometry_from_robot
+        drift_m, drift_rad = drift_sigmas(self.now_from_then)
+        self.is_fix = evidence.range_m is None and evidence.bearing_rad is None
+        factor = math.sqrt(max(repeated, 1))
+        self._teammate_m = factor * evidence.teammate_sigma_m
+        self._teammate_rad = factor * evidence.teammate_sigma_rad
+        self.sigma_m = math.hypot(self._teammate_m, drift_m)
+        self._sigma_rad = math.hypot(self._teammate_rad, drift_rad)
+
+    def pose(self) -> Pose2 | None:
+        """The present pose (field_from_robot), if a fix holds the whole of it."""
+        e = self.evidence
+        if e.heading_rad is None:
+            return None
+        return Pose2(e.x, e.y, e.heading_rad) @ self.now_from_then.inverse()
+
+    def point(self) -> tuple[float, float] | None:
+        """The object (or the robot then) in the present robot's frame, if its range is known."""
+        if self.is_fix:
+            return self.now_from_then.x, self.now_from_then.y
+        r, a = self.evidence.range_m, self.evidence.bearing_rad
+        if r is None or a is None:
+            return None
+        return self.now_from_then.transform(r * math.cos(a), r * math.sin(a))
+
+    def rows(self, pose: Pose2) -> Iterator[tuple[Row, float, float]]:
+        """(row, residual, variance) about the present pose."""
+        then = pose @ self.now_from_then
+        hx, hy = pose.y - then.y, then.x - pose.x  # d(position then) / d(heading now)
+        for (x, y, a), residual, variance in self.rows_then(then, self.sigma_m, self._sigma_rad):
+            yield (x, y, a + x * hx + y * hy), residual, variance
+
+    def rows_without_drift(self, then: Pose2) -> Iterator[tuple[Row, float, float]]:
+        """(row, residual, variance) about the pose of that time."""
+        return self.rows_then(then, self._teammate_m, self._teammate_rad)
+
+    def rows_then(
+        self, then: Pose2, sigma_m: float, sigma_rad: float
+    ) -> Iterator[tuple[Row, float, float]]:
+        """The same, with these sigmas beside the sensor's."""
+        e = self.evidence
+        if self.is_fix:
+            variance = _variance(sigma_m**2 + e.range_sigma_m**2)
+            yield (1.0, 0.0, 0.0), e.x - then.x, variance
+            yield (0.0, 1.0, 0.0), e.y - then.y, variance
+            if e.heading_rad is not None:
+                off = math.remainder(e.heading_rad - then.heading, math.tau)
+                yield (0.0, 0.0, 1.0), off, _variance(sigma_rad**2 + e.bearing_sigma_rad**2)
+            return
+        constraints: list[Constraint | None] = []
+        if e.range_m is not None:
+            constraints.append(range_circle(then, e.x, e.y, e.range_m, e.range_sigma_m))
+        if e.bearing_rad is not None:
+            constraints.append(bearing_heading(then, e.x, e.y, e.bearing_rad, e.bearing_sigma_rad))
+        for c in constraints:
+            if c is not None:
+                spread = sigma_m
+                if c.on_heading:
+                    spread = math.hypot(sigma_m / c.distance_m, sigma_rad)
+                yield c.row, c.residual, _variance(c.sigma**2 + spread**2)
+
+
+def _variance(variance: float) -> float:
+    return max(variance + SMALLEST_VARIANCE, _SHARPEST)
 
 
 def _cost(pose: Pose2, pieces: list[PropagatedEvidence]) -> float:
@@ -170,12 +248,11 @@ def _alignment(pieces: list[PropagatedEvidence]) -> Pose2 | None:
 
 class Fit(NamedTuple):
     """A pose that fits some pieces of evidence, and the chi-square of all: of those that are left
-    out `OUTLIER` each. With the prior that it fits, too, if there is one."""
+    out `OUTLIER` each."""
 
     cost: float
     pose: Pose2
     used: list[PropagatedEvidence]
-    prior: PropagatedPrior | None = None
 
 
 def _fit(start: Pose2, pieces: list[PropagatedEvidence]) -> Fit | None:
@@ -209,20 +286,17 @@ def _with_drift(fit: Fit, noise: OdometryNoise) -> tuple[float, Estimate]:
     around its path, and around the better one."""
     pose = fit.pose
     for _ in range(2):
-        covariance, offset, cost = _filtered(pose, fit, noise)
+        covariance, offset, cost = _filtered(pose, fit.used, noise)
         pose = offset_pose(pose, offset, POSE)
     return cost, Estimate(pose, covariance)
 
 
-def _filtered(pose: Pose2, fit: Fit, noise: OdometryNoise) -> FilteredOffset:
+def _filtered(pose: Pose2, used: list[PropagatedEvidence], noise: OdometryNoise) -> FilteredOffset:
     """The least chi-square, its offset from `pose` and the offset's covariance, by a Kalman filter
-    from the prior, or the oldest piece, to the present. It is linear around the path that ends at
-    `pose`."""
-    state, last = FilteredOffset(_OPEN), None
-    if fit.prior is not None:
-        last = pose @ fit.prior.now_from_then
-        state = fit.prior.about(last)
-    for piece in (*fit.used, None):
+    from the oldest piece to the present. It is linear around the path that ends at `pose`."""
+    state = FilteredOffset(_OPEN)
+    last = None
+    for piece in (*used, None):
         then = pose if piece is None else pose @ piece.now_from_then
         if last is not None:
             covariance, (x, y, heading), cost = state
@@ -239,7 +313,7 @@ def _filtered(pose: Pose2, fit: Fit, noise: OdometryNoise) -> FilteredOffset:
 
 
 def _wider_covariance(
-    cost: float, estimate: Estimate, fit: Fit, noise: OdometryNoise
+    cost: float, estimate: Estimate, used: list[PropagatedEvidence], noise: OdometryNoise
 ) -> Covariance3 | None:
     """The covariance, wider along its weakest axis where the chi-square rises less there than that
     of a Gaussian; None if it rises so little somewhere that the pose may be elsewhere.
@@ -249,7 +323,7 @@ def _wider_covariance(
     """
     variance, (x, y, h) = _weakest_axis(estimate.covariance)
     sigma = math.sqrt(variance)
-    profile = [_profile(estimate.pose, k * sigma, (x, y, h), fit, noise) for k in STEPS]
+    profile = [_profile(estimate.pose, k * sigma, (x, y, h), used, noise) for k in STEPS]
     wider = 1.0
     for k, (least, _) in zip(STEPS, profile, strict=True):
         if not least - cost > 0.0:
@@ -268,12 +342,12 @@ def _wider_covariance(
 
 
 def _profile(
-    origin: Pose2, goal: float, axis: Row, fit: Fit, noise: OdometryNoise
+    origin: Pose2, goal: float, axis: Row, used: list[PropagatedEvidence], noise: OdometryNoise
 ) -> tuple[float, Row]:
     """(chi-square, offset) of the best pose among those that are so far along an axis."""
     offset, least = _sum((0.0, 0.0, 0.0), axis, goal), math.nan
     for _ in range(3):
-        covariance, step, least = _filtered(offset_pose(origin, offset, POSE), fit, noise)
+        covariance, step, least = _filtered(offset_pose(origin, offset, POSE), used, noise)
         towards = covariance.times(axis)
         along = _dot(axis, towards)
         if along <= 0.0:

@@ -14,8 +14,11 @@ from typing import Final, NamedTuple
 from cpcbl_team.estimate import POSE, Estimate, FilteredOffset, offset_pose
 from cpcbl_team.fusion import chi_square_bound
 from cpcbl_team.geometry import Pose2
-from cpcbl_team.propagated_evidence import PropagatedEvidence, readings_of
-from cpcbl_team.relocalization import OUTLIER
+from cpcbl_team.relocalization import (
+    OUTLIER,
+    PropagatedEvidence,
+    readings_of,
+)
 from cpcbl_team.state import Evidence
 
 LEAST_READINGS: Final = 4

@@ -14,7 +14,6 @@ from typing import Any, NamedTuple
 from cpcbl_team.arcs import with_arc_width
 from cpcbl_team.common_errors import CommonErrors
 from cpcbl_team.config import Field, Start
-from cpcbl_team.delayed_prior import DelayedPrior
 from cpcbl_team.estimate import HEADING, POSE, POSITION, ZERO3, Covariance3, Estimate, Scope
 from cpcbl_team.geometry import Pose2, new, wrap_angle
 from cpcbl_team.inputs import Belief, LandmarkBelief, Odometry, Sighting
@@ -144,7 +143,6 @@ class RecoveryMemory(NamedTuple):
     mistake: str = ""  # of its driver, that explains what it rejects; it does not move meanwhile
     jump: Jump | None = None  # the latest
     misplaced: Mapping[str, int] = _NONE  # objects that stand elsewhere: until when not used
-    delayed: DelayedPrior | None = None  # while what it measures determines no pose
 
     def unused_objects(self, now_ns: int) -> frozenset[str]:
         """Those of `misplaced` that are not used now."""
@@ -381,6 +379,19 @@ def with_calibration(state: State, calibration: CalibrationMemory) -> State:
 def with_common_errors(state: State, common: CommonErrors) -> State:
     """The state that knows this of the errors that its sightings have in common."""
     return with_calibration(state, state.memory.calibration._replace(common=common))
+
+
+def with_records(
+    recovery: RecoveryMemory,
+    snapshots: tuple[LandmarkSnapshot, ...],
+    evidence: tuple[Evidence, ...],
+    recorded: frozenset[str],
+    until_ns: int,
+) -> RecoveryMemory:
+    """The recovery's memory with other evidence, and the sources of which no more is needed."""
+    lost, inflated_ns, relocated_ns, _, _, _, _, *others = recovery
+    parts = lost, inflated_ns, relocated_ns, snapshots, evidence, recorded, until_ns, *others
+    return new(RecoveryMemory, parts)
 
 
 def with_correction(state: State, estimate: Estimate, updates: Updates) -> State:

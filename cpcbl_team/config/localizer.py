@@ -62,8 +62,3 @@ class LocalizerSettings(Table, frozen=True, kw_only=True):
     def estimates_whole_pose(self) -> bool:
         """Whether heading and position are one estimate, with the uncertainty of both."""
         return self.variant == "joint" and not (self.alternates or self.paper_uncertainty)
-
-    @property
-    def follows_arcs(self) -> bool:
-        """Whether the whole pose is estimated along an arc while the heading is uncertain."""
-        return self.estimates_whole_pose or (self.variant == "oval" and not self.paper_uncertainty)

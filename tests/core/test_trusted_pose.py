@@ -23,7 +23,7 @@ from support.core import (
 from cpcbl_team.config import SensorSettings
 from cpcbl_team.geometry import Pose2, wrap_angle
 from cpcbl_team.inputs import Sighting
-from cpcbl_team.propagated_evidence import readings_of
+from cpcbl_team.relocalization import readings_of
 from cpcbl_team.sensor_mistakes import (
     FOOT_M,
     HALF_OFF,

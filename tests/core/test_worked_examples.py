@@ -39,8 +39,7 @@ from cpcbl_team.inputs import Odometry
 from cpcbl_team.measurements import Measurement, observation_of
 from cpcbl_team.motion import bridge, inflate_by_gap
 from cpcbl_team.places import ObjectPosition
-from cpcbl_team.propagated_evidence import PropagatedEvidence
-from cpcbl_team.relocalization import relocalize
+from cpcbl_team.relocalization import PropagatedEvidence, relocalize
 from cpcbl_team.state import Evidence
 
 ORIGIN = Pose2(0.0, 0.0, 0.0)
