@@ -50,8 +50,8 @@ BUGS = {
     "fresh budget": Bug(
         robot.Robot,
         "__init__",
-        "restarted=restarted,\n                match_s",
-        "restarted=False,\n                match_s",
+        "restarted=restarted,",
+        "restarted=False,",
     ),
     "free beliefs": Bug(
         collaboration.CollaborationAgent,
