@@ -373,6 +373,21 @@ def test_a_slow_reader_loses_poses_and_gets_the_newest(monkeypatch: pytest.Monke
     with_gateway(check)
 
 
+def test_a_stream_that_was_held_back_gets_the_newest_pose_however_old(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(pose_feeds, "FRESH_S", 0.0)
+
+    async def check(stand: Stand) -> None:
+        robot = stand.bus.publisher(topics.POSE.at(robot="me"), topics.POSE.qos)
+        stream = await stand.stream()
+        robot.put(encode(pose(7)))
+        assert (await stream.receive_json())["pose"]["stamp_ns"] == 7
+        await stream.close()
+
+    with_gateway(check)
+
+
 def test_more_clients_than_allowed_are_turned_away() -> None:
     async def check(stand: Stand) -> None:
         streams = [await stand.stream(), await stand.stream("mate")]

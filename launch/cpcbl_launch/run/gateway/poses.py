@@ -21,12 +21,14 @@ class PoseFeed:
         self._robot, self._bus, self._loop = robot, bus, asyncio.get_running_loop()
         self._subscriber: Subscriber[Pose] | None = None
         self._readers: set[asyncio.Event] = set()
-        self._newest, self._received_s, self._used_s = "", -FRESH_S, 0.0
+        self._received_s, self._used_s = -FRESH_S, 0.0
+        self.latest = ""
+        """The newest pose, however long ago it came; empty before the first."""
 
     @property
     def newest(self) -> str:
         """The newest pose; empty if none came in the last 3 s."""
-        return self._newest if self._loop.time() - self._received_s < FRESH_S else ""
+        return self.latest if self._loop.time() - self._received_s < FRESH_S else ""
 
     @contextmanager
     def reader(self) -> Iterator[asyncio.Event]:
@@ -63,6 +65,6 @@ class PoseFeed:
             self._loop.call_soon_threadsafe(self._store, received.message)
 
     def _store(self, pose: Pose) -> None:
-        self._newest, self._received_s = encode_json(pose).decode(), self._loop.time()
+        self.latest, self._received_s = encode_json(pose).decode(), self._loop.time()
         for came in self._readers:
             came.set()

@@ -170,7 +170,8 @@ class Gateway:
             while True:
                 await came.wait()
                 came.clear()
-                await stream.send_str(f'{{"pose": {feed.newest}}}')
+                # To a client that does not read, sending takes long: the pose may be old by then
+                await stream.send_str(f'{{"pose": {feed.latest}}}')
 
 
 async def serve(
