@@ -50,9 +50,10 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 @pytest.fixture(autouse=True)
 def log_levels_are_as_at_first() -> None:
-    """A command that ran in the process of a test, or of a module's fixture, may say less of the
-    bus than others."""
-    logging.getLogger("cpcbl_transport").setLevel(logging.NOTSET)
+    """A command that ran in the process of a test, or of a module's fixture, may say less than
+    others: `replay` of what robots said in the run itself."""
+    for package in ("cpcbl_agents", "cpcbl_launch", "cpcbl_team", "cpcbl_transport"):
+        logging.getLogger(package).setLevel(logging.NOTSET)
 
 
 @pytest.fixture(autouse=True, scope="module")
