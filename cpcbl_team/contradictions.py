@@ -6,7 +6,7 @@ still agrees with the trusted pose, after others began to contradict it, speaks 
 that each stand where the other is on the map were exchanged, in the file or on the field.
 """
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from itertools import groupby, takewhile
 from typing import Final, NamedTuple
 
@@ -14,80 +14,77 @@ from cpcbl_team.estimate import Estimate, FilteredOffset
 from cpcbl_team.geometry import Pose2
 from cpcbl_team.relocalization import OUTLIER, PropagatedEvidence, readings_of
 from cpcbl_team.state import Evidence, RecoveryMemory, State
-from cpcbl_team.trusted_pose import LATEST_NS, agrees, explaining_mistake, propagated_pose
+from cpcbl_team.trusted_pose import LATEST_NS, agrees, expected_pose, explaining_mistake
 
 KNOWN_M: Final = 0.25  # sigmas of a pose at which agreement is no chance
 KNOWN_RAD: Final = 0.15
 AGREEMENT: Final = 9.2  # the chi-square of a piece that agrees (99 % of two readings)
 LEAST_CONTRADICTIONS: Final = 3  # pieces of evidence: fewer may be outliers
-READINGS: Final = 2  # that must agree for each object that contradicts
+AGREEING_READINGS: Final = 2  # are needed for each object that contradicts
 UNUSED_NS: Final = 120_000_000_000  # for so long such an object is not used; then it is tried again
 
 
-class _Agreement(NamedTuple):
-    """What the pieces of evidence of one object say of a pose."""
+class Comparison(NamedTuple):
+    """What the evidence of objects of the map says of a pose. An object whose latest piece neither
+    agrees nor contradicts says nothing."""
 
-    pieces: Sequence[Evidence]  # the latest, that all agree or all contradict
-    contradicts: bool
-
-    @property
-    def is_clear(self) -> bool:
-        return not self.contradicts or len(self.pieces) >= LEAST_CONTRADICTIONS
-
-    @property
-    def since_ns(self) -> int:
-        """Since when it surely contradicts: the first piece may have been an outlier."""
-        return self.pieces[min(1, len(self.pieces) - 1)].stamp_ns
+    contradicting: Mapping[str, Sequence[Evidence]]
+    """By object: its latest pieces that contradict the pose, one after the other."""
+    agreeing: Sequence[Evidence]  # the latest piece of each object that agrees
 
 
-def misplaced_objects(
+def compared_with_pose(
     known: Estimate,
     evidence: Sequence[Evidence],
     odometry_from_robot: Pose2,
     names: Collection[str],
-) -> frozenset[str]:
-    """The objects of the map, of these `names`, that stand elsewhere if the robot is at the pose
-    `known`; empty if nothing tells that it is there. `evidence`: its latest, in order of time."""
-
-    def chi_square(e: Evidence) -> float:
-        return _chi_square(known, e, odometry_from_robot)
-
+) -> Comparison:
+    """The comparison of a pose with the robot's own evidence of the objects of these names, which
+    is in order of time."""
+    contradicting, agreeing = dict[str, Sequence[Evidence]](), list[Evidence]()
     own = [e for e in evidence if not e.from_teammate and e.source in names]
-    agreements = _agreements(own, chi_square)
-    wrong = {name: v for name, v in agreements.items() if v.contradicts}
-    right = [v.pieces[-1] for v in agreements.values() if not v.contradicts]
-    found = {
-        name
-        for name, v in wrong.items()
-        if v.is_clear
-        and sum(readings_of(e) for e in right if e.stamp_ns > v.since_ns) >= READINGS * len(wrong)
-    }
-    return frozenset(found)
+    by_object = sorted(own, key=lambda e: e.source)  # stable: each in order of time
+    for name, pieces in groupby(by_object, key=lambda e: e.source):
+        latest_first = [(e, _chi_square(known, e, odometry_from_robot)) for e in pieces][::-1]
+        latest, least = latest_first[0]
+        if least >= OUTLIER:
+            far = takewhile(lambda piece: piece[1] >= OUTLIER, latest_first)
+            contradicting[name] = [e for e, _ in far][::-1]
+        elif least < AGREEMENT:
+            agreeing.append(latest)
+    return Comparison(contradicting, agreeing)
+
+
+def misplaced_objects(found: Comparison) -> frozenset[str]:
+    """The objects of the map that stand elsewhere if the robot is at the pose; empty if nothing
+    tells that it is there."""
+    due = AGREEING_READINGS * len(found.contradicting)
+
+    def is_misplaced(pieces: Sequence[Evidence]) -> bool:
+        if len(pieces) < LEAST_CONTRADICTIONS:
+            return False
+        since_ns = pieces[1].stamp_ns  # the first piece may have been an outlier
+        return sum(readings_of(e) for e in found.agreeing if e.stamp_ns > since_ns) >= due
+
+    return frozenset(n for n, pieces in found.contradicting.items() if is_misplaced(pieces))
 
 
 def exchanged_objects(
-    known: Estimate,
-    evidence: Sequence[Evidence],
-    odometry_from_robot: Pose2,
-    names: Collection[str],
+    found: Comparison, known: Estimate, odometry_from_robot: Pose2
 ) -> frozenset[str]:
     """The two objects of the map that stand where the other one is, if nothing else contradicts the
-    pose `known`; empty if there are none. `evidence`: its latest, in order of time."""
-
-    def chi_square(e: Evidence) -> float:
-        return _chi_square(known, e, odometry_from_robot)
-
-    own = [e for e in evidence if not e.from_teammate and e.source in names]
-    wrong = {n: v.pieces for n, v in _agreements(own, chi_square).items() if v.contradicts}
-    if len(wrong) != 2 or sum(map(len, wrong.values())) < LEAST_CONTRADICTIONS:
+    pose `known`; empty if there are none."""
+    if len(found.contradicting) != 2:
         return frozenset()
-    a, b = wrong.values()
+    a, b = found.contradicting.values()
+    if len(a) + len(b) < LEAST_CONTRADICTIONS:
+        return frozenset()
     for pieces, other in ((a, b[0]), (b, a[0])):
-        there = [e._replace(x=other.x, y=other.y) for e in pieces]
-        agreeing = [e for e in there if readings_of(e) > 1 and chi_square(e) < AGREEMENT]
-        if 2 * len(agreeing) <= len(there):
+        there = [e._replace(x=other.x, y=other.y) for e in pieces if readings_of(e) > 1]
+        agreeing = [e for e in there if _chi_square(known, e, odometry_from_robot) < AGREEMENT]
+        if 2 * len(agreeing) <= len(pieces):
             return frozenset()
-    return frozenset(wrong)
+    return frozenset(found.contradicting)
 
 
 def explains_as_well(
@@ -116,28 +113,6 @@ def _chi_square(known: Estimate, e: Evidence, odometry_from_robot: Pose2) -> flo
     return FilteredOffset(known.covariance).after(rows).cost
 
 
-def _agreements(
-    evidence: Sequence[Evidence], chi_square: Callable[[Evidence], float]
-) -> Mapping[str, _Agreement]:
-    """By object. One whose latest piece neither agrees nor contradicts says nothing."""
-    found = {}
-    by_object = sorted(evidence, key=lambda e: e.source)  # stable: each in order of time
-    for name, pieces in groupby(by_object, key=lambda e: e.source):
-        judged = [(e, chi_square(e)) for e in pieces][::-1]
-        latest = judged[0][1]
-        if latest >= OUTLIER or latest < AGREEMENT:
-            found[name] = _Agreement(_alike(judged), contradicts=latest >= OUTLIER)
-    return found
-
-
-def _alike(judged: Sequence[tuple[Evidence, float]]) -> Sequence[Evidence]:
-    """The latest pieces (the latest first) that all contradict, or that all do not; in order of
-    time."""
-    contradicts = judged[0][1] >= OUTLIER
-    alike = takewhile(lambda j: (j[1] >= OUTLIER) is contradicts, judged)
-    return [e for e, _ in alike][::-1]
-
-
 def kept_at_trusted_pose(
     state: State,
     memory: RecoveryMemory,
@@ -147,20 +122,18 @@ def kept_at_trusted_pose(
 ) -> tuple[RecoveryMemory, Estimate | None] | None:
     """The memory of a robot that is where odometry leads it from its trusted pose, for objects of
     the map stand elsewhere, or for its evidence fits there as well as where it was `found`; and its
-    estimate there, None where its present one agrees with that. None if neither is so."""
-    if memory.trusted is None:
-        return None
-    place = state.odometry_from_robot
-    known = propagated_pose(memory.trusted, place)
+    estimate there, None where its present one agrees with that. None if neither is so. To be called
+    of a robot that has a trusted pose."""
+    place, known = state.odometry_from_robot, expected_pose(state, memory)
     # One that was not lost has kept to what agrees, and knows its pose better
     was_lost, present = state.memory.recovery.lost, state.estimate
     is_there = not was_lost and agrees(known, present, stands=True)
     known = present if is_there else known
-    xx, _, yy, _, _, hh = known.covariance
-    if 0.5 * (xx + yy) > KNOWN_M**2 or hh > KNOWN_RAD**2:
+    if known.position_sigma_m > KNOWN_M or known.heading_sigma_rad > KNOWN_RAD:
         return None
-    exchanged = exchanged_objects(known, evidence, place, names)
-    misplaced = exchanged or misplaced_objects(known, evidence, place, names)
+    comparison = compared_with_pose(known, evidence, place, names)
+    exchanged = exchanged_objects(comparison, known, place)
+    misplaced = exchanged or misplaced_objects(comparison)
     unused = misplaced | memory.unused_objects(state.stamp_ns)
     if 2 * len(unused) > len(names):
         return None

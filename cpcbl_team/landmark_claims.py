@@ -6,6 +6,8 @@ field is in its file. So a place of a robot that the file gives none is not take
 what it can have found.
 """
 
+from msgspec.structs import replace
+
 from cpcbl_team.config import Team
 from cpcbl_team.frames import knows_map
 from cpcbl_team.inputs import LandmarkBelief
@@ -35,7 +37,4 @@ class LandmarkClaims:
         more = max(0.0, least_m * least_m - min(xx, yy))
         if not more:
             return told
-        covariance = (xx + more, xy, yy + more)
-        return LandmarkBelief(
-            told.robot, told.landmark, told.stamp_ns, told.x_m, told.y_m, covariance
-        )
+        return replace(told, covariance=(xx + more, xy, yy + more))

@@ -258,12 +258,10 @@ class Recovery:
         """All the evidence in a memory, the latest last: of landmarks as the robot would measure
         them with this adaptation."""
         of_landmarks = self._landmarks.evidence_of
-        pieces: Sequence[Evidence] = [
-            piece for s in memory.snapshots for piece in of_landmarks(s, adaptation)
-        ]
+        pieces = [piece for s in memory.snapshots for piece in of_landmarks(s, adaptation)]
         pieces = sorted((*pieces, *memory.evidence), key=_stamp)
-        if memory.misplaced:
-            unused = memory.unused_objects(pieces[-1].stamp_ns) if pieces else frozenset()
+        if pieces and memory.misplaced:
+            unused = memory.unused_objects(pieces[-1].stamp_ns)
             pieces = [e for e in pieces if e.source not in unused]
         return latest(tuple(pieces))
 
@@ -309,6 +307,8 @@ class Recovery:
     ) -> State | None:
         """The state of a robot that is where odometry led it from its trusted pose, whatever it
         rejects; None if it may be elsewhere, as where it was `found`."""
+        if memory.trusted is None:
+            return None
         evidence = self._evidence_since(state, memory.suspected_ns)
         explained = kept_at_trusted_pose(state, memory, evidence, self._field.landmarks, found)
         if explained is None:

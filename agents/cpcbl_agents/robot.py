@@ -126,7 +126,7 @@ class Robot:
         )
         self.collaboration.frames.begin_frame(self.filter.frame)
         self._teammates = teammates
-        self._claims = LandmarkClaims(team, settings.collaboration.trust.least_sigma_m)
+        self._landmark_claims = LandmarkClaims(team, settings.collaboration.trust.least_sigma_m)
 
     def handle(
         self, message: Message | Tick | BusEvent, now_ns: int, frame: str = FIELD
@@ -145,7 +145,7 @@ class Robot:
         if isinstance(message, Help):  # it changes what is published at the next tick
             if frame == self.filter.frame:
                 if isinstance(message, LandmarkBelief):
-                    message = self._claims.believed(message)
+                    message = self._landmark_claims.believed(message)
                 self.filter.handle(self.collaboration.as_used(message), now_ns)
             else:
                 self.filter.handle_from_elsewhere(message, self._teammates, frame, now_ns)

@@ -10,7 +10,7 @@ from collections.abc import Collection, Iterable, Iterator, Mapping
 from cpcbl_agents.frame_claims import FrameClaims
 from cpcbl_agents.landmark_sharing import LandmarkSharing, known_tiers
 from cpcbl_team.config import CollaborationSettings
-from cpcbl_team.frames import FIELD, FrameOrder
+from cpcbl_team.frames import FIELD
 from cpcbl_team.inputs import LandmarkBelief
 from cpcbl_team.tiers import LOWEST_TIER
 from cpcbl_transport import topics
@@ -20,14 +20,9 @@ from cpcbl_transport.topics import ANY_TIER, tier_chunk
 class TeammateFrames:
     """What one robot knows of the tiers and frames of the others."""
 
-    def __init__(
-        self, robot: str, members: Collection[str], claims: FrameClaims | None = None
-    ) -> None:
+    def __init__(self, robot: str, members: Collection[str], claims: FrameClaims) -> None:
         """`members`: the other robots of the team file."""
-        self.frame = FIELD
-        """That of the robot itself."""
-        self._robot, self._members = robot, frozenset(members)
-        self._claims = claims or FrameClaims(robot, FrameOrder({}))
+        self._robot, self._members, self._claims = robot, frozenset(members), claims
         self._announced: dict[str, tuple[int, str]] = {}
         self._known: dict[str, dict[str, int]] = {}
         self.tiers: dict[str, int] = {}
@@ -35,10 +30,14 @@ class TeammateFrames:
         self.better_frames: list[str] = []
         """Those of teammates that are better than the robot's own, the best first."""
 
+    @property
+    def frame(self) -> str:
+        """That of the robot itself."""
+        return self._claims.own
+
     def begin_frame(self, frame: str) -> None:
         """The robot is in this frame from now on."""
-        self.frame = self._claims.own = frame
-        self._known = {}
+        self._claims.own, self._known = frame, {}
         self._select_better()
 
     def set_tier(self, name: str, tier: int | None, frame: str) -> None:

@@ -9,6 +9,7 @@ from support.core import diagonal
 from cpcbl_team.config import LocalizationSettings
 from cpcbl_team.contradictions import (
     UNUSED_NS,
+    compared_with_pose,
     contradicts,
     exchanged_objects,
     explains_as_well,
@@ -42,8 +43,15 @@ def seen(
     return Evidence(*where, range_m, bearing_rad, 0.1, 0.03)
 
 
+STILL = Pose2(0.0, 0.0, 0.0)
+
+
 def misplaced(*evidence: Evidence) -> frozenset[str]:
-    return misplaced_objects(KNOWN, evidence, Pose2(0.0, 0.0, 0.0), MAP)
+    return misplaced_objects(compared_with_pose(KNOWN, evidence, STILL, MAP))
+
+
+def exchanged(*evidence: Evidence) -> frozenset[str]:
+    return exchanged_objects(compared_with_pose(KNOWN, evidence, STILL, MAP), KNOWN, STILL)
 
 
 PUSHED = MAP | {"a": (4.0, 2.5)}
@@ -87,14 +95,14 @@ def test_bearings_alone_need_two_that_agree() -> None:
 
 
 def test_two_that_stand_where_the_other_is_on_the_map_are_exchanged() -> None:
-    places, still = MAP | {"a": MAP["b"], "b": MAP["a"]}, Pose2(0.0, 0.0, 0.0)
+    places = MAP | {"a": MAP["b"], "b": MAP["a"]}
     wrong = [seen(name, at_s, places=places) for at_s in (1.0, 1.5) for name in "ab"]
-    assert exchanged_objects(KNOWN, wrong, still, MAP) == {"a", "b"}
-    assert exchanged_objects(KNOWN, wrong[:2], still, MAP) == frozenset()  # too few
+    assert exchanged(*wrong) == {"a", "b"}
+    assert exchanged(*wrong[:2]) == frozenset()  # too few
     with_third = [*wrong, seen("c", 2.0, ELSEWHERE)]
-    assert exchanged_objects(KNOWN, with_third, still, MAP) == frozenset()
+    assert exchanged(*with_third) == frozenset()
     turned = [seen(e.source, e.stamp_ns / S, ELSEWHERE) for e in wrong]  # the robot is elsewhere
-    assert exchanged_objects(KNOWN, turned, still, MAP) == frozenset()
+    assert exchanged(*turned) == frozenset()
 
 
 @pytest.mark.parametrize(

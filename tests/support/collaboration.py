@@ -5,6 +5,7 @@ from typing import Any, TypeVar
 
 from cpcbl_agents.agent import BeliefSubscribers, FrameEstimate, HelpSent, PoseEstimate, Presence
 from cpcbl_agents.collaboration import CollaborationAgent
+from cpcbl_agents.frame_claims import FrameClaims
 from cpcbl_agents.guests import GuestRegistry
 from cpcbl_agents.landmark_sharing import LandmarkSharing
 from cpcbl_agents.message_counters import MessageCounter
@@ -19,6 +20,7 @@ from cpcbl_team.config import (
     Variant,
 )
 from cpcbl_team.estimate import Estimate
+from cpcbl_team.frames import FrameOrder
 from cpcbl_team.geometry import Pose2
 from cpcbl_team.inputs import Belief, Fix, Sighting, Sightings
 from cpcbl_transport.budget import Budget
@@ -61,7 +63,7 @@ class Alone:
             budget=Budget(budget, 0),
             guests=GuestRegistry(known=()),
             landmarks=LandmarkSharing("me", names=frozenset(), robots=1 + len(MATES)),
-            frames=TeammateFrames("me", MATES),
+            frames=TeammateFrames("me", MATES, FrameClaims("me", FrameOrder({}))),
         )
         self.now_ns = 0
         self.heard = True
