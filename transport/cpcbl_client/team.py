@@ -40,6 +40,10 @@ class _File(msgspec.Struct, frozen=True):
     transport: TransportSettings = TransportSettings()
 
 
+# At import: msgspec describes a type at its first use, and crashes if two threads do that at once
+msgspec.json.Decoder(_File)
+
+
 def read_team(path: str | Path) -> ClientTeam:
     """The team in a file. Raises InputError for one that cannot be used."""
     path = Path(path)

@@ -6,6 +6,7 @@ Outputs are sent as JSON under a key of their own (`topics.json_key`).
 """
 
 import re
+import threading
 from functools import lru_cache
 from typing import Any, TypeVar, get_args, get_origin
 
@@ -17,6 +18,7 @@ from cpcbl_transport.topics import Topic
 
 MessageT = TypeVar("MessageT", bound=Message)
 _NO_NUMBER = re.compile(rb"[:,\[\s][-+]?(?:NaN|nan|Infinity|inf)\b")
+_describing = threading.Lock()
 _REFUSED = (msgspec.DecodeError, UnicodeDecodeError, RecursionError)
 
 
@@ -52,14 +54,13 @@ def json_problem(payload: bytes, topic: Topic) -> str:
 
 def encode_json(message: Message) -> bytes:
     """An output as a JSON object."""
-    kind: Any = type(message)
-    return msgspec.json.encode(msgspec.convert(message, _object_type(kind), from_attributes=True))
+    kind = _object_decoder(type(message)).type
+    return msgspec.json.encode(msgspec.convert(message, kind, from_attributes=True))
 
 
 def decode_object(payload: bytes, kind: type[MessageT]) -> MessageT:
     """The message of this type in a JSON object. Raises msgspec.DecodeError and others."""
-    whole: Any = kind
-    found = msgspec.json.decode(payload, type=_object_type(whole))
+    found = _object_decoder(kind).decode(payload)
     return msgspec.convert(found, kind, from_attributes=True)
 
 
@@ -98,6 +99,22 @@ def _error_text(error: str, topic: Topic) -> str:
     if "`int`, got `float`" in problem and path.endswith("_ns"):
         return f"{text}; write whole nanoseconds, without a point or an exponent"
     return text
+
+
+def _object_decoder(kind: Any) -> msgspec.json.Decoder[Any]:
+    """The decoder of the JSON object for a message.
+
+    Messages come in threads of the bus. msgspec describes a type at its first use, and crashes if
+    two threads do that at once.
+    """
+    with _describing:
+        return _new_object_decoder(kind)
+
+
+@lru_cache
+def _new_object_decoder(kind: Any) -> msgspec.json.Decoder[Any]:
+    msgspec.json.Decoder(kind)  # what the object is converted to or from
+    return msgspec.json.Decoder(_object_type(kind))
 
 
 @lru_cache

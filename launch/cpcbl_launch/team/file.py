@@ -17,6 +17,9 @@ from cpcbl_launch.team.faults import layer_faults, number_faults, one_line, tabl
 from cpcbl_team.config import RobotSettings, Team
 from cpcbl_team.errors import InputError
 
+# At import: msgspec describes a type at its first use, and crashes if two threads do that at once
+_team_decoder = msgspec.json.Decoder(Team)
+
 Layer = dict[str, Any]
 MOST_LINES = 20  # of an error
 MOST_ROUNDS = 20  # of removing keys that have faults: what is left may lack something
@@ -98,7 +101,7 @@ def save_resolved(team: Team, path: Path) -> None:
 def decode_resolved(data: bytes, name: str) -> Team:
     """The team in what `save_resolved` wrote, or a recording holds. Raises TeamFileError."""
     try:
-        team = msgspec.json.decode(data, type=Team)
+        team = _team_decoder.decode(data)
         faults: list[object] = [*number_faults(msgspec.json.decode(data))]
     except (msgspec.MsgspecError, RecursionError, UnicodeError) as error:
         raise TeamFileError.of(name, [error]) from error
