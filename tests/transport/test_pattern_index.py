@@ -1,6 +1,6 @@
 """An index of patterns finds what `matches` finds one by one, in the order of adding."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from typing import NamedTuple
 
 import pytest
@@ -8,7 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.buses import examples, matches
 
-from cpcbl_transport.memory_bus import PatternIndex, patterns_of
+from cpcbl_transport.memory_bus import MOST_CHANGES, MemoryHub, PatternIndex, patterns_of
+from cpcbl_transport.topics import Qos
 
 CHUNK = st.sampled_from(["a", "b", "belief", "3", "r1"])
 KEY = st.lists(CHUNK, min_size=1, max_size=4).map("/".join)
@@ -32,7 +33,7 @@ def by_itself(keys: str) -> tuple[str, ...]:
 
 @st.composite
 def indices(
-    draw: st.DrawFn, keys: st.SearchStrategy[str], patterns: Callable[[str], tuple[str, ...]]
+    draw: st.DrawFn, keys: st.SearchStrategy[str], patterns: Callable[[str], Collection[str]]
 ) -> tuple[PatternIndex[Kept], list[Kept]]:
     """An index into which things were put, of which some were taken back; and those that are
     left."""
@@ -64,7 +65,7 @@ def test_a_pattern_finds_the_keys_that_it_includes(
     made: tuple[PatternIndex[Kept], list[Kept]], pattern: str
 ) -> None:
     index, kept = made
-    assert index.find([pattern]) == [k for k in kept if matches(pattern, k.keys)]
+    assert index.find({pattern}) == [k for k in kept if matches(pattern, k.keys)]
 
 
 @pytest.mark.parametrize("keys", ["a/b", "a/*", "a/**", "**"])
@@ -85,3 +86,22 @@ def test_nothing_is_left_of_keys_that_come_and_go() -> None:
     assert len(index._things) > 50
     assert all(remove() for remove in removals)
     assert not index._things
+
+
+@pytest.mark.parametrize("others", [0, 1, MOST_CHANGES - 1, MOST_CHANGES, 2 * MOST_CHANGES])
+def test_a_publisher_knows_its_subscribers_however_much_else_has_changed(others: int) -> None:
+    hub = MemoryHub()
+    publisher, session = hub.session().publisher("a/b/3", Qos.FRESH), hub.session()
+
+    def change_others() -> None:
+        for number in range(others):
+            session.subscribe(f"c/{number}", lambda key, payload: None)
+
+    assert not publisher.matching
+    for pattern in ("a/b/3", "a/*/3", "**"):
+        subscription = session.subscribe(pattern, lambda key, payload: None)
+        change_others()
+        assert publisher.matching
+        subscription.close()
+        change_others()
+        assert not publisher.matching

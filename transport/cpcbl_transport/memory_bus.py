@@ -1,6 +1,6 @@
 """The bus inside one process: deterministic, for simulations in one process and for tests."""
 
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection, Set
 from functools import lru_cache, partial
 from itertools import count
 from typing import Generic, NamedTuple, TypeVar
@@ -10,6 +10,7 @@ from cpcbl_transport.topics import Qos
 
 Thing = TypeVar("Thing")
 HandleT = TypeVar("HandleT", bound=Handle)
+MOST_CHANGES = 32  # that an index remembers
 
 
 class _Subscriber(NamedTuple):
@@ -45,8 +46,8 @@ class _MemoryPublisher:
     def __init__(self, hub: MemoryHub, session: object, key: str) -> None:
         self._hub, self._session, self._key, self._open = hub, session, key, True
         self._patterns = patterns_of(key)
-        self._changes = -1  # of the subscribers, when these were found
         self._found: list[_Subscriber] = []
+        self._changes = 0  # of the subscribers, that are in what was found
 
     @property
     def matching(self) -> bool:
@@ -61,8 +62,9 @@ class _MemoryPublisher:
         """The subscribers of other sessions."""
         subscribers = self._hub.subscribers
         if self._changes != subscribers.changes:
-            found = subscribers.find(self._patterns)
-            self._found = [s for s in found if s.session is not self._session]
+            if subscribers.may_have_changed(self._patterns, self._changes):
+                found = subscribers.find(self._patterns)
+                self._found = [s for s in found if s.session is not self._session]
             self._changes = subscribers.changes
         return self._found
 
@@ -95,7 +97,7 @@ class MemoryBus(Bus):
 
     def watch_liveliness(self, keys: str, on_change: LivelinessCallback) -> Handle:
         watcher = self._keep(_Handle(self._hub.watchers.add([keys], on_change)))
-        for key in self._hub.tokens.find([keys]):
+        for key in self._hub.tokens.find({keys}):
             on_change(key, True)
         return watcher
 
@@ -112,13 +114,13 @@ class MemoryBus(Bus):
 
 
 @lru_cache(maxsize=4096)
-def patterns_of(key: str) -> tuple[str, ...]:
+def patterns_of(key: str) -> frozenset[str]:
     """All patterns that include a key, the key itself too: 47 for a key of four chunks."""
     beginnings, patterns = [""], ["**"]
     for chunk in key.split("/"):
         beginnings = [f"{b}{part}/" for b in beginnings for part in (chunk, "*")]
         patterns += [f"{b}**" for b in beginnings]
-    return (*patterns, *(b.removesuffix("/") for b in beginnings))
+    return frozenset([*patterns, *(b.removesuffix("/") for b in beginnings)])
 
 
 class PatternIndex(Generic[Thing]):
@@ -129,19 +131,20 @@ class PatternIndex(Generic[Thing]):
         self._things: dict[str, dict[int, Thing]] = {}
         self._numbers = count()
         self.changes = 0
-        """How often something was added or taken back: what was found holds until then."""
+        """How often something was added under a pattern or taken back."""
+        self._changed: list[str] = []  # the latest of these patterns
 
     def add(self, patterns: Collection[str], thing: Thing) -> Callable[[], bool]:
         """Adds a thing. What it returns takes it back, and says whether it was there."""
         number = next(self._numbers)
-        self.changes += 1
+        self._note_change(patterns)
         for pattern in patterns:
             self._things.setdefault(pattern, {})[number] = thing
         return partial(self._remove, patterns, number)
 
     def _remove(self, patterns: Collection[str], number: int) -> bool:
         was_there = False
-        self.changes += 1
+        self._note_change(patterns)
         for pattern in patterns:
             here = self._things.get(pattern, {})
             was_there |= here.pop(number, None) is not None
@@ -149,10 +152,18 @@ class PatternIndex(Generic[Thing]):
                 self._things.pop(pattern, None)
         return was_there
 
-    def find(self, patterns: Iterable[str]) -> list[Thing]:
+    def _note_change(self, patterns: Collection[str]) -> None:
+        self.changes += len(patterns)
+        self._changed = [*self._changed, *patterns][-MOST_CHANGES:]
+
+    def may_have_changed(self, patterns: Set[str], since: int) -> bool:
+        """Whether one of these patterns may be among the changes after the first `since`."""
+        number = self.changes - since
+        return number > MOST_CHANGES or not patterns.isdisjoint(self._changed[-number:])
+
+    def find(self, patterns: Set[str]) -> list[Thing]:
         """What lies under any of these patterns."""
         found: dict[int, Thing] = {}
-        for pattern in patterns:
-            if pattern in self._things:
-                found.update(self._things[pattern])
+        for pattern in patterns & self._things.keys():
+            found.update(self._things[pattern])
         return [found[number] for number in sorted(found)]
