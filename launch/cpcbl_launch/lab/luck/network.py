@@ -7,6 +7,7 @@ what the others do.
 
 import heapq
 from collections.abc import Callable
+from functools import partial
 from itertools import count
 from random import Random
 from typing import TypeVar
@@ -111,16 +112,16 @@ class Network:
 
     # Messages -----------------------------------------------------------------------------------
 
-    def carry(self, receiver: str, key: str, arrive: Callable[[], None]) -> None:
+    def carry(self, receiver: str, key: str, payload: bytes, arrive: MessageCallback) -> None:
         """Carries a message of the present sender; each copy arrives at its time."""
         if not self._active:
-            arrive()
+            arrive(key, payload)
             return
         for delay_ns in self._delays_ns(self.sender, receiver, key):
             if delay_ns:
-                self.at(self.now_ns + delay_ns, arrive)
+                self.at(self.now_ns + delay_ns, partial(arrive, key, payload))
             else:
-                arrive()
+                arrive(key, payload)
 
     def _delays_ns(self, sender: str, receiver: str, key: str) -> list[int]:
         """The delay of each copy that arrives."""
@@ -207,7 +208,7 @@ class _Watch:
     def synchronize(self) -> None:
         """Reports the tokens that have appeared, then those that have disappeared."""
         network, seen = self._network, self._seen
-        here = {key: network.owners[key] for key in network.hub.tokens.find([self._keys])}
+        here = {key: network.owners[key] for key in network.hub.tokens.find({self._keys})}
         sees = {
             owner: network.sees(self._viewer, owner) for owner in {*here.values(), *seen.values()}
         }
@@ -279,13 +280,13 @@ class _Session(BusProxy):
     def subscribe(self, keys: str, on_message: MessageCallback) -> Handle:
         network, is_open = self.network, [True]
 
-        def on_put(key: str, payload: bytes) -> None:
-            def arrive() -> None:
-                if is_open:  # a subscription that was taken back meanwhile receives nothing
-                    self._on_delivery(key, payload)
-                    on_message(key, payload)
+        def arrive(key: str, payload: bytes) -> None:
+            if is_open:  # a subscription that was taken back meanwhile receives nothing
+                self._on_delivery(key, payload)
+                on_message(key, payload)
 
-            network.carry(self.name, key, arrive)
+        def on_put(key: str, payload: bytes) -> None:
+            network.carry(self.name, key, payload, arrive)
 
         handle, listed = super().subscribe(keys, on_put), self.listed("subscriptions", keys)
 

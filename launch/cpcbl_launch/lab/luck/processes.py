@@ -94,6 +94,7 @@ class RobotProcess:
         self._report, self._wrap_bus, self._disk = report, wrap_bus, disk
         self.node: Node | None = None
         self._next_ns = NEVER_NS  # of the node: only a step changes it
+        self._has_arrivals = False
         self.witness: Witness | None = None
         self.is_paused = self._has_moved = False
         self._processes = self._stepped_ns = 0
@@ -122,7 +123,8 @@ class RobotProcess:
         self._processes += 1
         self.witness = Witness(self.name, self._team, network, self._report)
         self._bus = network.session(self.name, self.witness.note_delivery)
-        callbacks = NodeCallbacks(on_status=self._on_status)
+        self._has_arrivals = False
+        callbacks = NodeCallbacks(self._on_arrival, self._on_status)
         watched = self.witness.watch(robot)
         tape = NO_TAPE if self._disk is None else self._disk.tape(robot, self._team, start)
         self.node = Node(watched, self._team, self._wrap_bus(self._bus), start, callbacks, tape)
@@ -157,13 +159,16 @@ class RobotProcess:
         if self.node is None or self.is_paused:
             return False
         now_ns = self._network.now_ns
-        return self.node.waiting or self._next_ns <= now_ns + self.ahead_ns(now_ns)
+        return self._has_arrivals or self._next_ns <= now_ns + self.ahead_ns(now_ns)
 
     def step(self) -> None:
         now_ns = self._network.now_ns
         if self.node is not None:
             self.node.step(now_ns + self.ahead_ns(now_ns))
-            self._next_ns = self.node.next_ns
+            self._next_ns, self._has_arrivals = self.node.next_ns, self.node.waiting
+
+    def _on_arrival(self) -> None:
+        self._has_arrivals = True
 
     def _on_status(self, status: Status) -> None:
         assert self.node is not None

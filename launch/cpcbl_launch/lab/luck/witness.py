@@ -45,7 +45,7 @@ class Witness:
         self._name, self._team, self._network, self._report = name, team, network, report
         self.delivered = self.handled = self.helped = self.used = 0
         self._help_tiers: dict[tuple[type, str, int], int] = {}
-        self._used: dict[Input, int] = {}
+        self._used: set[Input] = set()
         self._newest_ns = 0
         self._checks = 0
         self._most = len(team.robots) + team.guests.most
@@ -84,7 +84,7 @@ class Witness:
         plain = Belief(*msgspec.structs.astuple(item)) if isinstance(item, HeadingBelief) else item
         if plain in self._used:
             self._fail("used once", f"{_text(item)} was used twice")
-        self._used[plain] = item.stamp_ns
+        self._used.add(plain)
         if item.stamp_ns < self._newest_ns - LATEST_NS:
             late_s = (self._newest_ns - item.stamp_ns) * 1e-9
             self._fail("not too late", f"{_text(item)} was used {late_s:.2f} s after a newer input")
@@ -122,7 +122,7 @@ class Witness:
 
     def _check_counts(self, node: Node) -> None:
         counts = node.counts
-        refused = sum(counts[reason] for reason in REFUSALS)
+        refused = sum([counts.get(reason, 0) for reason in REFUSALS])
         missing = self.delivered - refused - counts["frame_skipped"] - self.handled
         if node.waiting:  # in the middle of a step, or after a pause
             if not 0 <= missing <= INBOX + 1:
@@ -199,7 +199,7 @@ class Witness:
 
     def _forget(self) -> None:
         old_ns = self._newest_ns - KEPT_NS
-        self._used = {item: at_ns for item, at_ns in self._used.items() if at_ns > old_ns}
+        self._used.difference_update([item for item in self._used if item.stamp_ns <= old_ns])
         known = self._help_tiers.items()
         self._help_tiers = {name: tier for name, tier in known if name[2] > old_ns}
 
@@ -253,7 +253,7 @@ class _WatchedFilter(FilterAgent):
     @property
     def _refused(self) -> int:
         """How many inputs the timeline refused, as the robot counts them."""
-        return sum([self.counts[reason] for reason in OF_TIMELINE])
+        return sum([self.counts.get(reason, 0) for reason in OF_TIMELINE])
 
 
 class _WatchedTimeline(Timeline):
