@@ -38,13 +38,16 @@ class Grid:
         self._cells: dict[tuple[int, int], list[tuple[int, VisibleObject]]] = {}
         for number, seen in enumerate(objects):
             self._cells.setdefault(self._cell(seen.x, seen.y), []).append((number, seen))
+        self._near: dict[tuple[int, int], list[VisibleObject]] = {}  # as far as it was asked for
 
     def near(self, x: float, y: float) -> list[VisibleObject]:
         """All within reach of a place (metres) and some beyond, in the order they were given."""
-        column, row = self._cell(x, y)
-        cells = product((column - 1, column, column + 1), (row - 1, row, row + 1))
-        found = [numbered for cell in cells for numbered in self._cells.get(cell, ())]
-        return [seen for _, seen in sorted(found)]  # by number: no two are the same
+        column, row = own = self._cell(x, y)
+        if own not in self._near:
+            cells = product((column - 1, column, column + 1), (row - 1, row, row + 1))
+            found = [numbered for cell in cells for numbered in self._cells.get(cell, ())]
+            self._near[own] = [seen for _, seen in sorted(found)]  # no two have the same number
+        return self._near[own]
 
     def _cell(self, x: float, y: float) -> tuple[int, int]:
         return math.floor(x / self._side_m), math.floor(y / self._side_m)

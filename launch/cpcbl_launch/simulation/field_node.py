@@ -25,7 +25,7 @@ from cpcbl_team.errors import InputError
 from cpcbl_team.inputs import Odometry
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus, Handle, Publisher
-from cpcbl_transport.decoding import decode
+from cpcbl_transport.decoding import decode_by_key
 from cpcbl_transport.messages import Drive, Join, Refusal, SensorInput, encode, refusal
 
 log = logging.getLogger(__name__)
@@ -104,7 +104,7 @@ class FieldNode:
 
     def _handle(self, key: str, payload: bytes, now_ns: int) -> Refusal | None:
         """Handles a message by the clock of the field; returns the reason if it is refused."""
-        message = decode(key, payload)
+        message = decode_by_key(key, payload)
         if isinstance(message, Refusal):
             return message
         assert isinstance(message, Drive | Join)

@@ -110,7 +110,8 @@ class Noise:
         name = source if self._is_split else ""
         if name not in self._streams:
             self._streams[name] = np.random.default_rng((*self._seed, *name.encode()))
-        return float(self._streams[name].normal(0.0, sigma)) * self._factor
+        # What `normal(0.0, sigma)` gives, without the check of its arguments
+        return self._streams[name].standard_normal() * sigma * self._factor
 
 
 class SimulatedRobot:
