@@ -114,6 +114,9 @@ class Budget:
         if match_rate_hz is not None:
             match = MatchAllowance(start_ns, match_rate_hz, s.urgent_share, match_s)
             self._limits.append(match)
+        paces = [(limit.unit, limit.pace_s) for limit in self._limits]
+        self._byte_s = max([s for unit, s in paces if unit == "bytes"], default=0.0)
+        self._message_s = max([s for unit, s in paces if unit == "messages"], default=0.0)
 
     def admits(self, now_ns: int, size: int, urgent: bool) -> bool:
         """Whether every limit has room for a message of this size now."""
@@ -162,12 +165,7 @@ class Budget:
 
     def _earned_s(self, size: int, messages: int = 1) -> float:
         """The seconds in which messages of this size together are earned; 0 without limits."""
-        costs = self._costs(size, messages)
-        return max((limit.pace_s * amount for limit, amount in costs), default=0.0)
+        return max(self._byte_s * size, self._message_s * messages)
 
-    def _costs(
-        self, size: int, messages: int = 1
-    ) -> list[tuple[SlidingWindow | MatchAllowance, float]]:
-        return [
-            (limit, size if limit.unit == "bytes" else float(messages)) for limit in self._limits
-        ]
+    def _costs(self, size: int) -> list[tuple[SlidingWindow | MatchAllowance, float]]:
+        return [(limit, size if limit.unit == "bytes" else 1.0) for limit in self._limits]
