@@ -6,6 +6,7 @@ import platform
 import re
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
+from functools import cache
 from hashlib import blake2b
 from importlib import metadata
 from pathlib import Path
@@ -74,6 +75,7 @@ def header_of(robot: Robot, team: Team, start: NodeStart, is_guest: bool = False
     )
 
 
+@cache
 def program_version() -> str:
     """The version of this program, a digest of all sources that a robot's node consists of, and
     whether the core is compiled."""
