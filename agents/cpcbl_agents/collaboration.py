@@ -114,8 +114,9 @@ class CollaborationAgent:
 
     def handle(self, message: agent.AgentMessage, now_ns: int) -> Sequence[agent.AgentMessage]:
         match message:
-            case agent.PoseEstimate() if message.stamp_ns > self._track_ns:
-                return self._handle_estimate(message, now_ns)
+            case agent.PoseEstimate():
+                is_newer = message.stamp_ns > self._track_ns
+                return self._handle_estimate(message, now_ns) if is_newer else ()
             case agent.FrameEstimate():
                 self.landmarks.see(message.frame)
                 return self._fixes(message, now_ns)

@@ -52,6 +52,8 @@ class Declarations:
         """The tier that is announced."""
         self.frame = FIELD
         """The frame in which it is."""
+        self.tier_chunk = tier_chunk(LOWEST_TIER, FIELD)
+        """Both, as in keys; the lowest tier before there is one."""
         self.announced = 0
         """Tokens so far: one at first, one a change of tier."""
 
@@ -68,11 +70,12 @@ class Declarations:
         tier, neighbours, sources, landmarks, frame, others = interests
         is_new_frame = frame != self.frame
         is_new_tier, old_token = tier != self.tier or is_new_frame, self._token
-        self.frame = frame
+        if is_new_tier:
+            self.tier, self.frame = tier, frame
+            self.tier_chunk = tier_chunk(tier, frame)
         if self._says_frame and (is_new_frame or self._frame_token is None):
             self._declare_frame()
         if is_new_tier:
-            self.tier = tier
             own = {"robot": self._robot, "incarnation": self._incarnation}
             self._token = self._bus.declare_token(topics.ALIVE.at(tier=self.tier_chunk, **own))
             self.announced += 1
@@ -82,9 +85,9 @@ class Declarations:
             subscribe = self._bus.subscribe
             keys = self._subscribed_keys(tier)
             _declare(self._subscriptions, keys, lambda k: subscribe(k, self._on_message))
-        forgotten = sorted(self._neighbours - neighbours)
+        forgotten: list[str] = []
         if neighbours != self._neighbours:
-            self._neighbours = neighbours
+            forgotten, self._neighbours = sorted(self._neighbours - neighbours), neighbours
             tokens = (topics.ALIVE.at(robot=name) for name in neighbours)
             watch = self._bus.watch_liveliness
             _declare(self._watched, tokens, lambda k: watch(k, self._on_token))
@@ -94,11 +97,6 @@ class Declarations:
             if old_token is not None:
                 old_token.close()
         return forgotten
-
-    @property
-    def tier_chunk(self) -> str:
-        """The tier that is announced, as in keys; the lowest before there is one."""
-        return tier_chunk(LOWEST_TIER if self.tier is None else self.tier, self.frame)
 
     def _declare_frame(self) -> None:
         """Says in which frame the robot is from now on."""
@@ -117,6 +115,8 @@ class Declarations:
     def update_landmarks(self, tiers: Mapping[str, int]) -> frozenset[str]:
         """The landmarks whose places somebody asks for in these tiers. Publishers of others are
         taken back."""
+        if not (tiers or self._keys_of_landmarks):
+            return frozenset()
         keys = {self._landmark_key(name, tier): name for name, tier in sorted(tiers.items())}
         for key in [k for k in self._keys_of_landmarks if k not in keys]:
             publisher = self._publishers.pop(key, None)

@@ -126,6 +126,8 @@ class FilterAgent:
 
     def handle(self, message: AgentMessage, now_ns: int) -> Sequence[AgentMessage]:
         match message:
+            case Tick():  # first, for it comes most often
+                return self._handle_tick(now_ns)
             case Odometry():
                 if self._add(message) and message.stamp_ns > self._covered_ns:
                     self._odometry, self._covered_ns = message, message.stamp_ns
@@ -151,11 +153,14 @@ class FilterAgent:
                 self._guests.discard(name)
             case Presence(name) if name not in self._known:
                 self._guests.add(name)
-            case Tick() if now_ns >= self.next_ns:
-                changes = self._change_frame(now_ns)
-                frames, regular = self._frame_estimates(now_ns), self._regular_estimate(now_ns)
-                return [*changes, *frames, regular, *self._landmark_places(now_ns)]
         return ()
+
+    def _handle_tick(self, now_ns: int) -> Sequence[AgentMessage]:
+        if now_ns < self.next_ns:
+            return ()
+        changes = self._change_frame(now_ns)
+        frames, regular = self._frame_estimates(now_ns), self._regular_estimate(now_ns)
+        return [*changes, *frames, regular, *self._landmark_places(now_ns)]
 
     def _add(self, item: Input) -> bool:
         """Adds an input to the timeline; whether the timeline could use it."""

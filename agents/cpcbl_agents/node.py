@@ -22,7 +22,7 @@ from cpcbl_team.config import Team
 from cpcbl_team.frames import FIELD
 from cpcbl_team.inputs import Belief, Fix, LandmarkBelief
 from cpcbl_transport import messages, topics
-from cpcbl_transport.bus import Bus
+from cpcbl_transport.bus import Bus, Publisher
 from cpcbl_transport.compact import encode_help, received_bytes, sent_bytes
 from cpcbl_transport.decoding import decode_by_key, input_problem
 from cpcbl_transport.json_messages import encode_json, is_json
@@ -122,8 +122,8 @@ class Node:
         self._tokens = LivelinessTokens(self._team)
         self._subscribed: dict[object, str] = {BeliefSubscribers: "", FrameSubscribers: ""}
         self._explained: set[tuple[str, Refusal]] = set()
-        self._counts: Counter[str] = Counter()
-        self.received = MessageCounters()
+        self._publishers: dict[type, Publisher] = {}  # of messages whose key stays the same
+        self._counts, self.received = Counter[str](), MessageCounters()
         self._clocks = ClockMonitor(rules.trust, speed) if rules.trust.enabled else None
         self._health = InputMonitor(robot.name, team, start_ns, speed)
         self._note_confirmation()
@@ -286,8 +286,15 @@ class Node:
 
     def _publish(self, message: Outgoing | Status) -> int:
         """Publishes if there is a subscriber; returns the bytes of the payload, 0 without one."""
-        topic, landmark = topic_of(type(message)), ""
-        tier = self._declarations.tier_chunk
+        publisher = self._publishers.get(type(message)) or self._publisher(message)
+        if not publisher.matching:
+            return 0
+        payload = encode_help(message) if isinstance(message, Help) else messages.encode(message)
+        publisher.put(payload)
+        return len(payload)
+
+    def _publisher(self, message: Outgoing | Status) -> Publisher:
+        topic, tier, landmark = topic_of(type(message)), self._declarations.tier_chunk, ""
         match message:
             case LandmarkBelief():
                 landmark = message.landmark
@@ -296,11 +303,9 @@ class Node:
                 tier = self.robot.collaboration.frames.fix_chunk(message.robot, tier)
         key = topic.at(tier=tier, robot=message.robot, observer=self._name, landmark=landmark)
         publisher = self._declarations.publisher(topic, key)
-        if not publisher.matching:
-            return 0
-        payload = encode_help(message) if isinstance(message, Help) else messages.encode(message)
-        publisher.put(payload)
-        return len(payload)
+        if not isinstance(message, Help):
+            self._publishers[type(message)] = publisher
+        return publisher
 
     def _publish_status(self, now_ns: int) -> None:
         counts = self.counts + Counter(announced=self._declarations.announced)

@@ -5,7 +5,7 @@ is not imported: numpy for a log, OpenCV for a camera.
 """
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple, get_args
 
@@ -139,6 +139,10 @@ class Robot:
         """
         if self.sensing.is_finished:
             return []
+        if isinstance(message, Tick):  # first, for it comes most often
+            return self._routed([message, *self.sensing.handle(message, now_ns)], now_ns)
+        if isinstance(message, SensorInput):
+            return self._routed(self.sensing.handle(message, now_ns), now_ns)
         if isinstance(message, BusEvent):
             self._handle_event(message, now_ns)
             return []
@@ -150,8 +154,10 @@ class Robot:
             else:
                 self.filter.handle_from_elsewhere(message, self._teammates, frame, now_ns)
             return []
-        inputs: list[AgentMessage] = [] if isinstance(message, SensorInput) else [message]
-        inputs += self.sensing.handle(message, now_ns)
+        return self._routed([message, *self.sensing.handle(message, now_ns)], now_ns)
+
+    def _routed(self, inputs: Sequence[AgentMessage], now_ns: int) -> list[Outgoing]:
+        """What is published because of what sensing makes of a message."""
         estimates = [out for m in inputs for out in self.filter.handle(m, now_ns)]
         outgoing = [out for m in estimates for out in self.collaboration.handle(m, now_ns)]
         outgoing += [out for m in estimates for out in self.sensing.handle(m, now_ns)]

@@ -128,6 +128,11 @@ class SensingAgent:
                 items = [item for source in self._sources for item in source.poll(now_ns)]
                 outgoing = [out for item in items for out in self._process(item)]
                 return [*outgoing, *self._collect()]
+            case PoseEstimate():
+                if self._correction is not None:
+                    self._correction.set_estimate(message.estimate, message.lost)
+                if self._follower is not None:
+                    return self._follower.command(message)
             case Odometry() | Sightings() | Position() | InitialPose() | Frame():
                 return self._process(message)
             case FrameChanged(_, new_from_old):
@@ -135,11 +140,6 @@ class SensingAgent:
                     self._follower.change_frame(new_from_old)
             case FrameSubscribers():
                 self._has_subscribers = message.present
-            case PoseEstimate():
-                if self._correction is not None:
-                    self._correction.set_estimate(message.estimate, message.lost)
-                if self._follower is not None:
-                    return self._follower.command(message)
         return ()
 
     def _process(self, item: SensorInput | Picture) -> Sequence[AgentMessage]:

@@ -97,7 +97,7 @@ class Topic(NamedTuple):
 
     def at(self, **names: object) -> str:
         """The key with these names; `*` for each that is left out."""
-        return _fill(self.key, tuple(names.items()))
+        return _fill(self.key, **names)
 
     def keys(self, **names: object) -> tuple[str, ...]:
         """All keys with these names: that of `at`, and the one under which it is sent as JSON."""
@@ -140,10 +140,9 @@ def is_json_key(key: str) -> bool:
 
 
 @lru_cache(maxsize=4096)
-def _fill(template: str, names: tuple[tuple[str, object], ...]) -> str:
+def _fill(template: str, /, **names: object) -> str:
     """The key of a template; a robot asks for few keys, but at every step."""
-    by_name = dict(names)
-    return re.sub(r"<(\w+)>", lambda found: str(by_name.get(found[1], "*")), template)
+    return re.sub(r"<(\w+)>", lambda found: str(names.get(found[1], "*")), template)
 
 
 @lru_cache
