@@ -7,12 +7,12 @@ from support.buses import SECOND
 from support.collaboration import POOR, Alone, ahead
 from support.drivers import DrivenRobot, World
 from support.mistake_rows import ODOMETRY, SEEN
-from support.mistakes import bearings
+from support.mistakes import bearings, of
 
 from cpcbl_agents.agent import BeliefSubscribers, Presence
 from cpcbl_team.config import OdometrySettings, Start
 from cpcbl_team.geometry import Pose2, wrap_angle
-from cpcbl_team.inputs import InitialPose
+from cpcbl_team.inputs import InitialPose, Sightings
 from cpcbl_transport.decoding import Subscriber
 from cpcbl_transport.messages import Pose
 
@@ -92,6 +92,18 @@ def test_a_known_start_needs_no_confirmation() -> None:
         robot = DrivenRobot(STAND._replace(settings=settings))
         robot.run(3.1)
         assert {s.unconfirmed for s in robot.statuses} == {""}
+
+
+@pytest.mark.parametrize("field", ["range_m", "bearing_rad"])
+@pytest.mark.parametrize("number", [math.inf, math.nan, 1e300])
+def test_numbers_that_nobody_measures_confirm_nothing_and_end_no_robot(
+    field: str, number: float
+) -> None:
+    wild = of(Sightings, **{field: lambda s: number if s.id == "p" else getattr(s, field)})
+    places = {**THREE, "t": (-2.0, -1.5)}
+    robot = DrivenRobot(SPIN._replace(places=places))
+    robot.run(4.1, wild)
+    assert "is not confirmed" in robot.statuses[-1].unconfirmed
 
 
 @pytest.mark.parametrize(("places", "said"), [(THREE, ""), (TWO, "fewer than three landmarks")])

@@ -23,6 +23,7 @@ from cpcbl_agents.input_diagnosis.problems import (
     implausible_inputs,
     input_problems,
     is_often_refused,
+    usable,
 )
 from cpcbl_agents.input_diagnosis.unusual_motion import UnusualMotion
 from cpcbl_agents.robot import InputSnapshot
@@ -74,7 +75,7 @@ class Input:
         self.recent: deque[tuple[int, SensorInput]] = deque(maxlen=latest)
         self.recent_refused: deque[tuple[int, bytes]] = deque(maxlen=4)
         self.steps: deque[Step] = deque(maxlen=STEPS)
-        self.spaced: deque[tuple[int, Sightings]] = deque(maxlen=STEPS)  # frames, ten a second
+        self.spaced: deque[tuple[int, Sightings]] = deque(maxlen=STEPS)  # usable, ten a second
         self.has_empty = False  # whether a frame came in which nothing was seen
         self.scales = 1.0, 1.0  # of distances and turns, as the team file corrects them
         self._begun: tuple[int, float, float] | None = None
@@ -88,7 +89,7 @@ class Input:
             self.decoded += len(message.sightings) or 1
             self.has_empty |= not message.sightings
             if not self.spaced or now_ns - self.spaced[-1][0] >= STEP_NS:
-                self.spaced.append((now_ns, message))
+                self.spaced.append((now_ns, usable(message)))
         else:
             self.decoded += 1
             if isinstance(message, Odometry):

@@ -110,7 +110,7 @@ class InputFacts(NamedTuple):
     steps: Sequence[Step] = ()  # of odometry
     frames: Sequence[Sightings] = ()  # within the same time
     long_steps: Sequence[Step] = ()  # of twice that time,
-    long_frames: Sequence[Sightings] = ()  # and frames, at most ten a second
+    long_frames: Sequence[Sightings] = ()  # and usable frames, at most ten a second
     corrections: str = ""  # what those of the pose say of inputs
     is_from_start: bool = False  # whether that time began at the start
     reported_by_start: Mapping[str, str] = {}  # earlier, by the start; nothing shows they are over
@@ -271,7 +271,7 @@ def _implausible(facts: InputFacts) -> Iterator[tuple[str, str]]:
     odometry = facts.windows.get("odometry", InputWindow(0.0))
     positions = facts.windows.get("position", InputWindow(0.0)).recent
     pieces = _odometry(facts)
-    frames = [_usable(frame) for frame in facts.frames]
+    frames = [usable(frame) for frame in facts.frames]
     overlap = bool(pieces) and has_overlap(odometry)
     if overlap and "duplicate" not in odometry.refused:
         text = "pieces overlap; two drivers, or from_ns is not where the last one ended"
@@ -369,7 +369,7 @@ def contradicts_mistake(facts: InputFacts) -> bool:
 
 def shift_of_frames(facts: InputFacts, since_ns: int = 0) -> Shift | None:
     """How landmarks shift in the long window, or since a time."""
-    frames = [_usable(frame) for frame in facts.long_frames if frame.stamp_ns > since_ns]
+    frames = [frame for frame in facts.long_frames if frame.stamp_ns > since_ns]
     steps = [step for step in facts.long_steps if step.from_ns >= since_ns]
     return shift_of(frames, steps, facts.landmarks, facts.sensor, facts.wheels)
 
@@ -381,14 +381,14 @@ def _shift_of_landmarks(
     move, if one does."""
     of_robot = facts.landmarks, facts.sensor, facts.wheels
     long_steps = facts.long_steps if steps else []
-    shift = shift_of([_usable(f) for f in facts.long_frames], long_steps, *of_robot)
+    shift = shift_of(facts.long_frames, long_steps, *of_robot)
     cause = shift_cause(shift, long_steps) if shift else ""
     if shift and cause and not is_same(shift, shift_of(frames, steps, *of_robot)):
         cause = ""  # the driver was mended meanwhile
     return shift is not None and is_sure(shift), cause
 
 
-def _usable(frame: Sightings) -> Sightings:
+def usable(frame: Sightings) -> Sightings:
     """The frame without sightings whose numbers cannot be used."""
     usable = [
         s
