@@ -2,6 +2,8 @@
 
 import random
 import tracemalloc
+from functools import cache
+from typing import TYPE_CHECKING
 
 import pytest
 from support.ros2_messages import plain, random_message, same
@@ -19,6 +21,9 @@ from cpcbl_transport.ros2.messages import (
     largest_payload,
 )
 from cpcbl_transport.ros2.names import NO_TYPE_HASH, Distribution, RosNameError
+
+if TYPE_CHECKING:
+    from rosbags.typesys.store import Typestore
 
 TYPES = {distribution: MessageTypes(distribution) for distribution in Distribution}
 JAZZY = TYPES[Distribution.JAZZY]
@@ -39,16 +44,19 @@ def test_what_is_written_is_read(distribution: Distribution, name: str) -> None:
 
 
 def _big_endian(types: MessageTypes, message: object, name: str) -> bytes:
-    from rosbags.typesys import Stores, get_typestore
-
-    store = get_typestore(Stores[f"ROS2_{_store_of(types.distribution)}"])
+    store = _store_of(types.distribution)
     if name not in store.fielddefs:  # the packages of `definitions`
         return types.encode(message)
     return bytes(store.serialize_cdr(message, name, little_endian=False))
 
 
-def _store_of(distribution: Distribution) -> str:
-    return "LYRICAL" if distribution is Distribution.ROLLING else distribution.upper()
+@cache
+def _store_of(distribution: Distribution) -> "Typestore":
+    """A store compiles its code for each type, so there is one for all messages."""
+    from rosbags.typesys import Stores, get_typestore
+
+    name = "LYRICAL" if distribution is Distribution.ROLLING else distribution.upper()
+    return get_typestore(Stores[f"ROS2_{name}"])
 
 
 def test_an_empty_message_is_no_rotation_and_nothing_else() -> None:
