@@ -59,10 +59,10 @@ class Light(NamedTuple):
     exposure: float = 1.0
 
     def lit(self, points: Floats) -> Floats:
-        """The share (n,) of the lamp that reaches points (n, 3)."""
+        """The share (n,) of the lamp that reaches points (3, n)."""
         if self.normal is None:
-            return np.ones(len(points))
-        into = (points - self.through) @ self.normal
+            return np.ones(points.shape[1])
+        into = self.normal @ (points - self.through[:, None])
         return np.asarray(np.clip(0.5 - into / self.penumbra_m, 0.0, 1.0))
 
 
@@ -81,14 +81,14 @@ class Lens(NamedTuple):
         return np.array([self.s.x_m, self.s.y_m, self.s.mounted_m])
 
     def rays(self, u: Floats, v: Floats) -> Floats:
-        """Directions (n, 3) of pixels."""
+        """Directions (3, n) of pixels."""
         x, y = (u - self.cx_px) / self.focal_px, (v - self.s.cy_px) / self.focal_px
         right = x * math.cos(self.roll) - y * math.sin(self.roll)
         down = x * math.sin(self.roll) + y * math.cos(self.roll)
         ahead = math.cos(self.tilt) - down * math.sin(self.tilt)
         up = -math.sin(self.tilt) - down * math.cos(self.tilt)
         c, s = math.cos(self.yaw), math.sin(self.yaw)
-        return np.stack([c * ahead + s * right, s * ahead - c * right, up], axis=1)
+        return np.stack([c * ahead + s * right, s * ahead - c * right, up])
 
     def pixels(self, points: Floats) -> Floats:
         """Pixels (n, 2) of points (n, 3)."""
@@ -228,22 +228,24 @@ class _Room:
             self._floors.append(cv2.pyrDown(self._floors[-1]).astype(np.float32))
 
     def albedo(self, origin: Floats, rays: Floats) -> tuple[Floats, Floats, NDArray[np.bool_]]:
-        """Of what rays (n, 3) meet: albedo (n, 3), points (n, 3), and whether it is the floor."""
+        """Of what rays (3, n) meet: albedo (3, n), points (3, n), and whether it is the floor."""
         with np.errstate(divide="ignore"):
-            down = np.where(rays[:, 2] < 0.0, -origin[2] / rays[:, 2], np.inf)
-            ahead = np.where(rays[:, 0] > 0.0, (self.wall_m - origin[0]) / rays[:, 0], np.inf)
+            down = np.where(rays[2] < 0.0, -origin[2] / rays[2], np.inf)
+            ahead = np.where(rays[0] > 0.0, (self.wall_m - origin[0]) / rays[0], np.inf)
         is_floor = down < ahead
         way = np.minimum(np.minimum(down, ahead), 1e3)
-        points = origin + way[:, None] * rays
+        points = origin[:, None] + way * rays
         floor_px, wall_px = self._px_per_m
-        x, y = (points[:, :2] * floor_px + self._shift[:2]).T
-        footprint = floor_px * way / (400.0 * np.maximum(-rays[:, 2], 0.05))
+        footprint = floor_px * way / (400.0 * np.maximum(-rays[2], 0.05))
         level = np.clip(np.log2(np.maximum(footprint, 1.0)), 0, LEVELS - 1).round().astype(int)
-        found = _sampled(self._wall, *(points[:, 1:] * wall_px + self._shift[2:]).T)
+        found = np.empty_like(points)
+        wall = np.flatnonzero(~is_floor)
+        y, z = (points[1:, wall].T * wall_px + self._shift[2:]).T
+        found[:, wall] = _sampled(self._wall, y, z).T
         for k, floor in enumerate(self._floors):
-            chosen = is_floor & (level == k)
-            if chosen.any():
-                found[chosen] = _sampled(floor, x[chosen] / 2**k, y[chosen] / 2**k)
+            chosen = np.flatnonzero(is_floor & (level == k))
+            x, y = (points[:2, chosen].T * floor_px + self._shift[:2]).T
+            found[:, chosen] = _sampled(floor, x / 2**k, y / 2**k).T
         return found, points, is_floor
 
 
@@ -259,6 +261,8 @@ def _muted(backgrounds: Sequence[Pixels], random: Random) -> Pixels:
 
 def _sampled(picture: NDArray[np.float32], x: Floats, y: Floats) -> Floats:
     """Levels (n, 3) at places of a picture that goes on as its mirror image."""
+    if not len(x):
+        return np.empty((0, 3))
     flat = (k.astype(np.float32).reshape(1, -1) for k in (x, y))
     height, width = picture.shape[:2]
     u, v = (
@@ -296,54 +300,66 @@ def _traced(lens: Lens, scene: _Scene, at: tuple[Floats, Floats]) -> Floats:
     light, axis, shape, paints, room = scene
     rays, origin = lens.rays(*(k.astype(np.float64) for k in at)), lens.at
     albedo, points, is_floor = room.albedo(origin, rays)
-    normals = np.where(is_floor[:, None], (0.0, 0.0, 1.0), (-1.0, 0.0, 0.0))
+    towards_lamp = np.where(is_floor, light.towards[2], -light.towards[0])  # of floor and wall
     lamp = light.lit(points) * _beside_the_shadow(points, light, axis, shape)
-    which, hits, outward = _cylinder(origin, rays, axis, shape)
-    on = which >= 0
-    albedo[on], points[on], normals[on] = paints[which[on]], hits[on], outward[on]
-    lamp[on] = 1.0 if light.floor_only else light.lit(points[on])
-    shade = np.clip(normals @ light.towards, 0.0, None) * lamp
-    levels = albedo * (light.room + light.lamp * shade[:, None])
+    hit = _cylinder(origin, rays, axis, shape)
+    albedo[:, hit.ray] = paints[hit.part].T
+    towards_lamp[hit.ray] = light.towards @ hit.normals
+    lamp[hit.ray] = 1.0 if light.floor_only else light.lit(hit.points)
+    shade = np.clip(towards_lamp, 0.0, None) * lamp
+    levels = albedo * (light.room[:, None] + light.lamp[:, None] * shade)
     if light.gloss:
-        half = light.towards - rays / np.linalg.norm(rays, axis=1, keepdims=True)
-        half /= np.linalg.norm(half, axis=1, keepdims=True)
-        shine = np.clip((normals * half).sum(axis=1), 0.0, 1.0) ** 60 * lamp * on
-        levels += light.gloss * light.lamp * shine[:, None]
-    return np.asarray(levels)
+        away = rays[:, hit.ray]
+        half = light.towards[:, None] - away / np.linalg.norm(away, axis=0)
+        half /= np.linalg.norm(half, axis=0)
+        shine = np.clip((hit.normals * half).sum(axis=0), 0.0, 1.0) ** 60 * lamp[hit.ray]
+        levels[:, hit.ray] += light.gloss * light.lamp[:, None] * shine
+    return np.asarray(levels.T)
 
 
-def _cylinder(
-    origin: Floats, rays: Floats, axis: Floats, shape: Cylinder
-) -> tuple[NDArray[np.int64], Floats, Floats]:
-    """Where rays meet the cylinder: 0 its top face, 1 the upper band, 2 the lower one, -1 if they
-    do not; the points and the outward normals there."""
+class _Hits(NamedTuple):
+    """The rays that meet the cylinder, by their numbers (m,), and where: 0 its top face, 1 the
+    upper band, 2 the lower one; the points and the outward normals there (3, m)."""
+
+    ray: NDArray[np.int64]
+    part: NDArray[np.int64]
+    points: Floats
+    normals: Floats
+
+
+def _cylinder(origin: Floats, rays: Floats, axis: Floats, shape: Cylinder) -> _Hits:
+    """Where rays (3, n) meet the cylinder."""
     apart = origin[:2] - axis[:2]
-    a = (rays[:, :2] ** 2).sum(axis=1)
-    b = rays[:, :2] @ apart
+    a = rays[0] ** 2 + rays[1] ** 2
+    b = rays[0] * apart[0] + rays[1] * apart[1]
     inner = b * b - a * (apart @ apart - shape.radius_m**2)
-    way = (-b - np.sqrt(np.maximum(inner, 0.0))) / a
-    points = origin + way[:, None] * rays
-    z = points[:, 2] - shape.foot_m
-    which = np.where(z > 0.5 * shape.height_m, 1, 2)
-    which[(inner <= 0.0) | (way <= 0.0) | (z < 0.0) | (z > shape.height_m)] = -1
-    normals = (points - axis) / shape.radius_m
-    normals[:, 2] = 0.0
+    near = np.flatnonzero(inner > 0.0)  # they meet the endless cylinder
+    a, b, inner, rays = a[near], b[near], inner[near], rays[:, near]
+    way = (-b - np.sqrt(inner)) / a
+    points = origin[:, None] + way * rays
+    z = points[2] - shape.foot_m
+    part = np.where(z > 0.5 * shape.height_m, 1, 2)
+    part[(way <= 0.0) | (z < 0.0) | (z > shape.height_m)] = -1
+    normals = (points - axis[:, None]) / shape.radius_m
+    normals[2] = 0.0
     top = shape.foot_m + shape.height_m
     if origin[2] > top:
         with np.errstate(divide="ignore"):
-            way = np.where(rays[:, 2] < 0.0, (top - origin[2]) / rays[:, 2], 0.0)
-        face = origin + way[:, None] * rays
-        on = (way > 0.0) & (((face - axis)[:, :2] ** 2).sum(axis=1) < shape.radius_m**2)
-        which[on], points[on], normals[on] = 0, face[on], (0.0, 0.0, 1.0)
-    return which, points, normals
+            way = np.where(rays[2] < 0.0, (top - origin[2]) / rays[2], 0.0)
+        face = origin[:, None] + way * rays
+        on = (way > 0.0) & (((face - axis[:, None])[:2] ** 2).sum(axis=0) < shape.radius_m**2)
+        part[on], points[:, on], normals[:, on] = 0, face[:, on], np.array([[0.0], [0.0], [1.0]])
+    met = part >= 0
+    return _Hits(near[met], part[met], points[:, met], normals[:, met])
 
 
 def _beside_the_shadow(points: Floats, light: Light, axis: Floats, shape: Cylinder) -> Floats:
-    """The share (n,) of the lamp that the landmark does not keep from points of floor and wall."""
+    """The share (n,) of the lamp that the landmark does not keep from points (3, n) of floor and
+    wall."""
     flat = light.towards[:2] / np.hypot(*light.towards[:2])
-    apart = points[:, :2] - axis[:2]
-    behind, beside = -apart @ flat, np.abs(apart @ np.array([-flat[1], flat[0]]))
-    above = points[:, 2] + behind * light.towards[2] / np.hypot(*light.towards[:2])
+    apart = points[:2] - axis[:2, None]
+    behind, beside = -(flat @ apart), np.abs(np.array([-flat[1], flat[0]]) @ apart)
+    above = points[2] + behind * light.towards[2] / np.hypot(*light.towards[:2])
     soft = light.penumbra_m
     hidden = np.clip((shape.radius_m - beside) / soft + 0.5, 0.0, 1.0)
     hidden *= np.clip((shape.foot_m + shape.height_m - above) / soft + 0.5, 0.0, 1.0)
