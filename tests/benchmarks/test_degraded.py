@@ -4,13 +4,14 @@ The bounds of recall are below those of the better of OpenCV's detector and pupi
 frames of `make bench-degraded` by what 20 frames leave to chance.
 """
 
+from functools import cache
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 from benchmarks.degraded import Score, false_markers, measured, printed
-from benchmarks.degraded_frames import KINDS, textures
+from benchmarks.degraded_frames import KINDS, Pixels, textures
 from benchmarks.photographs import tags_read
 from benchmarks.readers import opencv_reader, own_reader
 
@@ -34,8 +35,13 @@ LEAST_RECALL = {
 LEAST_STANDARD_RECALL = {"clean": 0.6, "low light": 0.4, "occlusion": 0.5, "noise": 0.5}
 
 
+@cache
+def backgrounds() -> list[Pixels]:
+    return textures(4, np.random.default_rng(3))
+
+
 def score_without_wrong(kind: str, family: MarkerFamily) -> Score:
-    score = measured(kind, FRAMES, family, textures(4, np.random.default_rng(3)), seed=2)
+    score = measured(kind, FRAMES, family, backgrounds(), seed=2)
     assert score.wrong == 0
     return score
 
@@ -61,10 +67,10 @@ def test_markers_of_a_bad_camera_are_recalled_and_none_is_wrong(kind: str) -> No
 def test_no_marker_is_in_pictures_without_one(frames: int) -> None:
     """The families whose codes are the shortest are the likeliest to be seen where there are none;
     `make bench-degraded` has natural pictures."""
-    backgrounds = textures(12, np.random.default_rng(4))
+    natural = textures(12, np.random.default_rng(4))
     families: tuple[MarkerFamily, ...] = ("aruco_4x4_50", "apriltag_16h5")
     for family in families:
-        assert false_markers(family, backgrounds, frames, seed=1) == 0
+        assert false_markers(family, natural, frames, seed=1) == 0
 
 
 def test_the_tags_of_photographs_are_counted_where_they_are(tmp_path: Path) -> None:

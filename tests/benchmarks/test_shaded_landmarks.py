@@ -8,7 +8,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from benchmarks.degraded_frames import textures
+from benchmarks.degraded_frames import Pixels, textures
 from benchmarks.landmark_frames import LIGHTS, LightKind, Lit
 from benchmarks.shaded_landmarks import false_landmarks, printed, score_of, shaded_frames
 
@@ -18,8 +18,13 @@ FRAMES = 16
 
 
 @cache
+def backgrounds() -> list[Pixels]:
+    return textures(6, np.random.default_rng(3))
+
+
+@cache
 def frames_of(light: LightKind) -> list[tuple[str, Lit]]:
-    return list(shaded_frames(light, FRAMES, textures(6, np.random.default_rng(3)), seed=4))
+    return list(shaded_frames(light, FRAMES, backgrounds(), seed=4))
 
 
 @pytest.mark.parametrize("light", LIGHTS)

@@ -1,6 +1,7 @@
 """Pictures of a calibration board as a known camera with distortion takes them."""
 
 from collections.abc import Iterator
+from functools import cache
 from typing import NamedTuple
 
 import cv2
@@ -39,6 +40,7 @@ def board_pictures(
         yield Shot(_picture(rays, sheet, turn, centre, board, random), turn, centre)
 
 
+@cache
 def undistorted_grid(settings: CameraSettings) -> Floats:
     """Where the samples of all pixels look, on the plane z = 1: (height x FINER, width x FINER, 2).
 
