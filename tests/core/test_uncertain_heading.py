@@ -33,7 +33,7 @@ from cpcbl_team.state import State
 
 ODOMETRY, SENSOR = OdometrySettings(), SensorSettings()
 PIECE_NS = SECOND // 10
-BLIND, SEEN = 200, 300  # pieces
+BLIND, SEEN = 200, 150  # pieces
 AHEAD = 0.05  # m a piece
 ONE = {"post": Landmark(x_m=12.0, y_m=2.0)}
 FOUR = {
