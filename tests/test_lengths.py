@@ -4,6 +4,8 @@ import ast
 from collections.abc import Iterator
 from pathlib import Path
 
+from support.sources import definitions
+
 TOP = Path(__file__).parents[1]
 FOLDERS = ("cpcbl_team", "transport", "agents", "launch", "tests")
 MOST_LINES_OF_A_FILE = 400
@@ -16,7 +18,7 @@ def _files() -> Iterator[Path]:
 
 
 def _long_functions(path: Path) -> Iterator[str]:
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    for node in definitions(path.read_text(encoding="utf-8")):
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
             assert node.end_lineno is not None
             lines = node.end_lineno - node.lineno + 1

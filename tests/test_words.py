@@ -1,9 +1,10 @@
 """No private word names a function, a class or a module of the product: the field's terms do."""
 
-import ast
 import re
 from collections.abc import Iterator
 from pathlib import Path
+
+from support.sources import definitions
 
 TOP = Path(__file__).parents[1]
 FOLDERS = ("cpcbl_team", "transport", "agents", "launch")
@@ -29,12 +30,11 @@ PRIVATE = set(
 )
 
 
-def definitions(path: Path) -> Iterator[str]:
+def names(path: Path) -> Iterator[str]:
     """The names of a module and of its functions and classes."""
     yield path.stem
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
-            yield node.name
+    for node in definitions(path.read_text(encoding="utf-8")):
+        yield node.name
 
 
 def test_no_definition_is_named_by_a_private_word() -> None:
@@ -42,7 +42,7 @@ def test_no_definition_is_named_by_a_private_word() -> None:
         f"{path.relative_to(TOP)}: {name}"
         for folder in FOLDERS
         for path in sorted((TOP / folder).rglob("*.py"))
-        for name in definitions(path)
+        for name in names(path)
         if name.strip("_") in PRIVATE
     ]
     assert not found, "\n".join(found)
