@@ -14,7 +14,7 @@ SHORT = [
     *(("drift", "scout"), ("headings", "navigator"), ("no majority", "scout")),
     ("one axis", "scout"),
 ]
-SHORT_S = 35.0
+SHORT_S = 30.0
 
 pytestmark = pytest.mark.timeout(300)
 
