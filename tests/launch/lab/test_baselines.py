@@ -70,7 +70,7 @@ def test_without_noise_there_is_no_error(tmp_path: Path, blind: list[str]) -> No
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> list[dict[str, BaselineReport]]:
     """Five noisy logs."""
-    return [reports_of(noisy_log(tmp_path_factory.mktemp("log"), seed)) for seed in range(5)]
+    return [reports_of(noisy_log(tmp_path_factory.mktemp("log"), seed, 25.0)) for seed in range(5)]
 
 
 def test_more_information_gives_a_smaller_error(runs: list[dict[str, BaselineReport]]) -> None:
