@@ -16,6 +16,7 @@ from setuptools.command.build_ext import build_ext
 HOT = (
     "arc_fit",
     "arcs",
+    "calibration_filter",
     "constant_errors",
     "constraints",
     "estimate",
@@ -33,7 +34,6 @@ HOT = (
     "object_timers",
     "own_calibration",
     "prediction",
-    "range_errors",
     "recovery",
     "recovery_evidence",
     "relinearization",

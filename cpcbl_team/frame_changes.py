@@ -41,7 +41,7 @@ def begun_in_frame(state: State, start: Start | None, field: Field) -> State:
         total_turn_rad=calibration.total_turn_rad,
         adaptation=calibration.adaptation,
         rejections=MapRejections(stamp_ns=state.stamp_ns),
-        ranges=calibration.ranges,
+        filters=calibration.filters,
         common=None if common is None else common.without_objects().uncorrelated(),
         unplaced=calibration.unplaced,
     )

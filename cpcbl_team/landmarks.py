@@ -38,7 +38,6 @@ from cpcbl_team.gaussian import width_per_m
 from cpcbl_team.geometry import Pose2, new, wrap_angle
 from cpcbl_team.inputs import Sighting
 from cpcbl_team.miscalibration import AS_CONFIGURED, Adaptation
-from cpcbl_team.range_errors import SeenLandmark
 from cpcbl_team.sensors import (
     LARGEST_BEARING_RAD,
     LARGEST_M,
@@ -262,16 +261,6 @@ class Landmarks:
             )  # fmt: skip
             pieces.append(new(Evidence, piece))
         return pieces
-
-    def seen_landmarks(self, snapshot: LandmarkSnapshot) -> list[SeenLandmark]:
-        """The landmarks of a snapshot that were seen with range and bearing."""
-        _, _, pose, sightings = snapshot
-        sigma, found = self._bearing_sigma_rad, []
-        for r in self._readings(sightings, pose):
-            if r.range_m is not None and r.bearing is not None:
-                seen = SeenLandmark(r.name, r.x, r.y, r.range_m, r.bearing, r.variance, sigma)
-                found.append(seen)
-        return found
 
     def _readings(self, sightings: Sequence[Sighting], pose: Pose2) -> list[Reading]:
         """What each landmark of a snapshot was seen with first, as far as it is used."""

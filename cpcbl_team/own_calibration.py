@@ -5,8 +5,18 @@ other one changes its settings only where they are wrong (`miscalibration.py`).
 """
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
+from typing import Final
 
+from cpcbl_team.calibration_filter import (
+    FILTERS,
+    LONGEST_NS,
+    MOST_REJECTED,
+    CalibrationFilter,
+    Frame,
+    SeenLandmark,
+    correction,
+)
 from cpcbl_team.config import Field, LocalizationSettings, OdometryNoise
 from cpcbl_team.constant_errors import NO_ERRORS, NO_EVIDENCE, pose_offset
 from cpcbl_team.estimate import POSE, offset_pose
@@ -32,10 +42,12 @@ from cpcbl_team.miscalibration import (
     noise_with_factor,
 )
 from cpcbl_team.motion import NO_VARIANCE, MotionVariance, distance_variance, turn_variance
-from cpcbl_team.range_errors import NO_RANGE_ERRORS, RangeErrors, SeenLandmark
+from cpcbl_team.range_errors import NO_RANGE_ERRORS
 from cpcbl_team.recovery_evidence import SPACING_NS
 from cpcbl_team.self_calibration import ReferencePose, ReferencePoses, self_calibrate
-from cpcbl_team.state import CalibrationMemory, RecoveryMemory, State, with_calibration
+from cpcbl_team.state import CalibrationMemory, State, with_calibration
+
+MOST_BEGIN_M: Final = 0.5  # sigma of a position with which the second filter begins
 
 
 class OwnCalibration:
@@ -59,6 +71,8 @@ class OwnCalibration:
             independent_share=block_s / (block_s + 2.0 * correlation_s),
             knows_covariance=rules.variant != "circular",
         )
+        self._correlation_s, names = correlation_s, sorted(field.landmarks)
+        self._left_out = [frozenset(names[i::FILTERS]) for i in range(FILTERS)]
         self._independent_frames = spacing_s / (spacing_s + 2.0 * correlation_s)
 
     def is_known(self, state: State) -> bool:
@@ -118,7 +132,7 @@ class OwnCalibration:
             return state  # corrections of the pose tell of the camera
         begin, _, _, _, _, _, _, _, path_ns = check
         if begin is None or now_ns - begin.stamp_ns >= BLOCK_NS:
-            return self._after_check(self._with_ranges(self._with_residuals(state)))
+            return self._after_check(self._with_filters(self._with_residuals(state)))
         if now_ns - path_ns >= STEP_NS:
             return self._with_check(state, check.with_place(now_ns, place), present)
         return state
@@ -158,39 +172,74 @@ class OwnCalibration:
         residuals = sums.residuals(state.estimate.covariance)
         return with_calibration(state, memory._replace(residuals=residuals))
 
-    def _with_ranges(self, state: State) -> State:
-        """The state that has compared distances between landmarks with the map, once a block."""
-        memory, recovery = state.memory.calibration, state.memory.recovery
-        if memory.check.begin is None or recovery.lost:
+    def _with_filters(self, state: State) -> State:
+        """The state whose second filters have used the landmarks that were seen, once a block; with
+        the errors of the sensor that these are sure of corrected."""
+        memory, filters = state.memory.calibration, self._filters_after(state)
+        if not filters:
             return state
         present = memory.adaptation
-        frames = self._frames_since(recovery, memory.check.begin.stamp_ns, present.ranges)
-        ranges = memory.ranges.plus(frames)
-        errors = ranges.errors(present.ranges, self._independent_frames)
-        if errors != present.ranges:
-            if present.ranges == NO_RANGE_ERRORS:
-                state = state.counted("miscalibrated")
-                # What was collected with other ranges is void
-                memory = memory._replace(check=ModelCheck(accepted=state.updates.accepted))
-            memory = memory._replace(adaptation=present._replace(ranges=errors))
-        return with_calibration(state, memory._replace(ranges=ranges))
+        changed = correction(filters, present)
+        if changed is None:
+            return with_calibration(state, memory._replace(filters=filters))
+        is_first = present.bearing_bias_rad == 0.0 != changed.bearing_bias_rad
+        is_first |= present.ranges == NO_RANGE_ERRORS != changed.ranges
+        if not is_first:
+            return with_calibration(state, memory._replace(filters=filters, adaptation=changed))
+        # What was found with the errors is void, the pose and other changes of the settings too
+        place, estimate = state.odometry_from_robot, state.estimate
+        distance, turn, _ = errors_between(present, AS_CONFIGURED)
+        filters = tuple([f.with_scales(distance, turn) for f in filters])
+        _, _, bias_rad, _, _, ranges = changed
+        only = AS_CONFIGURED._replace(bearing_bias_rad=bias_rad, ranges=ranges)
+        state = self.without_adaptation(state.counted("miscalibrated"))
+        memory = state.memory.calibration._replace(filters=filters, adaptation=only)
+        state = state._replace(estimate=filters[0].estimate_at(place, estimate))
+        return with_calibration(state, memory)
 
-    def _frames_since(
-        self, recovery: RecoveryMemory, since_ns: int, present: RangeErrors
-    ) -> Iterable[list[SeenLandmark]]:
-        """The landmarks that were seen with range and bearing after this time, by frames."""
-        frames: dict[int, list[SeenLandmark]] = {}
-        for e in recovery.evidence:
-            stamp_ns, _, name, x, y, range_m, bearing, sigma_m, sigma_rad, _, of_teammate, _, _ = e
-            if stamp_ns <= since_ns or of_teammate or range_m is None or bearing is None:
-                continue
-            read_m = (range_m - present.offset_m) / present.scale  # these are corrected
-            seen = SeenLandmark(name, x, y, read_m, bearing, sigma_m * sigma_m, sigma_rad)
-            frames.setdefault(stamp_ns, []).append(seen)
+    def _filters_after(self, state: State) -> tuple[CalibrationFilter, ...]:
+        """The second filters after the landmarks that were seen since; empty before they begin."""
+        now_ns, estimate, place, odometry, until_ns, _, (recovery, _, memory, events) = state
+        filters, begin = memory.filters, memory.check.begin
+        if recovery.lost or memory.common is not None or not self._names_of_landmarks:
+            return filters
+        if not filters or any(f.rejected > MOST_REJECTED for f in filters):
+            is_known = estimate.position_sigma_m < MOST_BEGIN_M
+            new_one = CalibrationFilter.at(now_ns, place, estimate)
+            return (new_one,) * FILTERS if is_known else ()
+        is_broken = begin is None or events.get("odometry_gap", 0) > begin.gaps
+        is_broken |= odometry is not None and until_ns < now_ns
+        is_broken |= now_ns - filters[0].stamp_ns > LONGEST_NS
+        if is_broken:
+            return tuple([f.with_pose(now_ns, place, estimate) for f in filters])
+        frames = self._frames_since(state, filters[0].stamp_ns)
+        return tuple(
+            [
+                f.after(frames, self._noise, self._correlation_s, self._left_out[i])
+                for i, f in enumerate(filters)
+            ]
+        )
+
+    def _frames_since(self, state: State, since_ns: int) -> list[Frame]:
+        """The landmarks that were seen after this time, as the sensor read them."""
+        recovery, memory = state.memory.recovery, state.memory.calibration
+        present, pieces = memory.adaptation, list(recovery.evidence)
         for snapshot in recovery.snapshots:
             if snapshot[0] > since_ns:
-                frames.setdefault(snapshot[0], []).extend(self._landmarks.seen_landmarks(snapshot))
-        return frames.values()
+                pieces += self._landmarks.evidence_of(snapshot, present)
+        unused = recovery.unused_objects(state.stamp_ns) | {memory.residuals.misplaced}
+        frames: dict[int, Frame] = {}
+        for e in pieces:
+            stamp_ns, place, name, x, y, range_m, bearing, sigma_m, sigma_rad, _, _, _, _ = e
+            if stamp_ns <= since_ns or name not in self._names_of_landmarks or name in unused:
+                continue
+            if range_m is not None:  # pieces are corrected
+                range_m = (range_m - present.ranges.offset_m) / present.ranges.scale
+            if bearing is not None:
+                bearing += present.bearing_bias_rad
+            seen = SeenLandmark(name, x, y, range_m, bearing, sigma_m * sigma_m, sigma_rad**2)
+            frames.setdefault(stamp_ns, Frame(stamp_ns, place, [])).seen.append(seen)
+        return sorted(frames.values())
 
     def _after_learning(self, state: State) -> State:
         memory, place = state.memory.calibration, state.odometry_from_robot
@@ -245,6 +294,11 @@ class OwnCalibration:
         evidence = NO_EVIDENCE
         if errors != NO_ERRORS:
             evidence = check.evidence.without(errors)
+        if errors != NO_ERRORS:
+            distance, turn, _ = errors
+            memory = state.memory.calibration
+            filters = tuple([f.with_scales(distance, turn) for f in memory.filters])
+            state = with_calibration(state, memory._replace(filters=filters))
         check = ModelCheck(
             now, check.sensitivity, evidence, 0, "", accepted, doubts, (), now.stamp_ns
         )

@@ -12,6 +12,7 @@ from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from cpcbl_team.arcs import with_arc_width
+from cpcbl_team.calibration_filter import CalibrationFilter
 from cpcbl_team.common_errors import CommonErrors
 from cpcbl_team.config import Field, Start
 from cpcbl_team.estimate import HEADING, POSE, POSITION, ZERO3, Covariance3, Estimate, Scope
@@ -22,7 +23,6 @@ from cpcbl_team.map_rejections import MapRejections
 from cpcbl_team.map_residuals import MapResiduals
 from cpcbl_team.miscalibration import AS_CONFIGURED, Adaptation, ModelCheck, with_doubts
 from cpcbl_team.moved_landmarks import Innovations, Moves
-from cpcbl_team.range_errors import RangeEvidence
 from cpcbl_team.self_calibration import ReferencePoses, SelfCalibration
 from cpcbl_team.sender_records import SenderRecord
 from cpcbl_team.stationary_pose import StationaryRecord
@@ -178,7 +178,7 @@ class CalibrationMemory(NamedTuple):
     check: ModelCheck = ModelCheck()
     adaptation: Adaptation = AS_CONFIGURED
     rejections: MapRejections = MapRejections()
-    ranges: RangeEvidence = RangeEvidence()
+    filters: tuple[CalibrationFilter, ...] = ()  # of its errors; empty before they begin
     common: CommonErrors | None = None
     """What is known of the constant errors of the camera; None without a camera whose errors the
     filter considers."""

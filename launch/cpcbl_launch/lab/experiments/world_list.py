@@ -223,6 +223,14 @@ def _miscalibrated_worlds() -> dict[str, World]:
         truth = _alone(field, **{"odometry" if is_odometry else "sensor": part})
         world = World(_alone(field), ("r",), truth=truth)
         found[name] = world._replace(duration_s=2.0 * LEARNING_S, scored_from_s=LEARNING_S)
+    field, narrow = _field(8), replace(sensor, field_of_view_deg=60.0)
+    for name, wrong in (
+        ("bearings 5 deg off, view of 60 deg", replace(narrow, bearing_bias_deg=5.0)),
+        ("ranges a tenth too long, view of 60 deg", replace(narrow, range_scale=1.0 / 1.1)),
+    ):
+        truth = _alone(field, sensor=wrong)
+        world = World(_alone(field, sensor=narrow), ("r",), truth=truth)
+        found[name] = world._replace(duration_s=4.0 * LEARNING_S, scored_from_s=2.0 * LEARNING_S)
     return found
 
 

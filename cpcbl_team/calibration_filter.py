@@ -1,0 +1,366 @@
+"""A second filter of a robot: its pose together with the errors of its own calibration.
+
+The filter of the robot takes its settings for right. A camera that is turned by 5°, or ranges that
+are a tenth too long, then make it wrong for ever and sure of it, for few landmarks at once fit
+nearly any calibration. But no wrong calibration fits all the places to which a robot drives. So
+here five constant errors are states beside the pose: the bias of bearings, the share and the bias
+of ranges, and the scales of distances and turns (state augmentation; A. H. Jazwinski, Stochastic
+Processes and Filtering Theory, 1970, section 8.4). It uses the landmarks of the map alone, each
+once a second: nothing that a teammate says.
+
+A landmark that stands elsewhere than on the map is like an error of ranges to who passes it on one
+side. So each robot has `FILTERS` of these, and each of them leaves out other landmarks: what all of
+them find is no error of one place.
+
+It begins with a pose that is hardly known, for the pose of the robot's own filter has the same
+errors in it.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from math import cos, sin, sqrt
+from statistics import fmean
+from types import MappingProxyType
+from typing import Final, NamedTuple
+
+from cpcbl_team.config import OdometryNoise
+from cpcbl_team.estimate import Covariance3, Estimate
+from cpcbl_team.geometry import Pose2, new, wrap_angle
+from cpcbl_team.miscalibration import LEAST_BIAS_RAD, MOST_BIAS_RAD, Adaptation
+from cpcbl_team.motion import distance_variance, turn_variance
+from cpcbl_team.range_errors import NO_RANGE_ERRORS, RangeErrors
+from cpcbl_team.sensors import repetition_variance_factor
+
+_atan2: Final = math.atan2  # see `constraints._atan2`
+FILTERS: Final = 3
+BEARING: Final = 3  # places of the errors in a state; the pose comes first
+SHARE: Final = 4
+OFFSET: Final = 5
+DISTANCE: Final = 6
+TURN: Final = 7
+SIZE: Final = 8
+FIRST_SIGMAS: Final = (math.radians(5.0), 0.05, 0.1, 0.1, 0.1)  # rad, 1, m, 1, 1
+DRIFT: Final = (1e-7, 1e-8, 1e-8, 1e-8, 1e-8)  # variances that a second adds: of a knock
+POSITION_VARIANCE, HEADING_VARIANCE = 0.5**2, math.radians(20.0) ** 2
+"""What is added to those of the robot's own pose (m^2, rad^2) where this filter begins."""
+SPACING_NS: Final = 1_000_000_000  # between two sightings of a landmark
+LONGEST_NS: Final = 10_000_000_000  # between two frames: of a longer way the path matters
+GATE: Final = 16.0  # chi-square of a sighting; 0.03 % of correct ones are beyond
+MOST_REJECTED: Final = 8  # in a row; then the filter begins anew
+FADING: Final = 0.99  # of the sum of the chi-squares, a sighting
+LEAST_USED: Final = 40  # sightings
+LEAST_LANDMARKS: Final = 2
+SIGMAS: Final = 3.0  # of a bias that is believed, in each filter,
+CLEAR: Final = 11.8  # and the chi-square of errors of ranges: as unlikely, with two degrees
+LEAST_SHARE: Final = 0.03  # of a range: what the first correction must be,
+LEAST_SHARE_AGAIN, LEAST_BIAS_AGAIN_RAD = 0.005, math.radians(0.3)  # and others
+MOST_SHARE: Final = 0.3
+ALIKE: Final = 0.5  # by less than this part of it one filter's share differs from their mean
+SETTLED_RAD: Final = math.radians(1.0)  # sigma of a bias that is known
+
+Rows = tuple[tuple[float, ...], ...]
+_NONE: Final[Mapping[str, int]] = MappingProxyType({})
+
+
+class SeenLandmark(NamedTuple):
+    """A landmark of the map at (x, y) (m) as its sensor reads it, without any correction."""
+
+    name: str
+    x: float
+    y: float
+    range_m: float | None
+    bearing_rad: float | None
+    range_variance: float  # m^2
+    bearing_variance: float  # rad^2
+
+
+class Frame(NamedTuple):
+    """What was seen at one time, and where the robot was then by odometry."""
+
+    stamp_ns: int
+    odometry_from_robot: Pose2
+    seen: list[SeenLandmark]
+
+
+class CalibrationFilter(NamedTuple):
+    """Pose and errors as they are known at one time. `errors`: what bearings are too large by
+    (rad); what ranges are too short by, as a share and in metres; what distances and turns are too
+    short by, as a share."""
+
+    stamp_ns: int
+    odometry_from_robot: Pose2
+    pose: Pose2
+    errors: tuple[float, ...]
+    covariance: Rows  # 8 x 8: of x, y (m), heading (rad) and the errors
+    used_ns: Mapping[str, int] = _NONE  # when a landmark was used last
+    chi_squares: float = 0.0  # fading sums: of readings,
+    readings: float = 0.0  # and their number
+    used: int = 0  # sightings,
+    metres: float = 0.0  # and the sum of their ranges
+    rejected: int = 0  # in a row
+
+    @staticmethod
+    def at(stamp_ns: int, place: Pose2, estimate: Estimate) -> "CalibrationFilter":
+        """A filter that knows nothing of the errors. `place`: of the robot by odometry."""
+        rows = [[0.0] * SIZE for _ in range(SIZE)]
+        for i, sigma in enumerate(FIRST_SIGMAS):
+            rows[BEARING + i][BEARING + i] = sigma * sigma
+        errors = (0.0,) * len(FIRST_SIGMAS)
+        found = CalibrationFilter(stamp_ns, place, estimate.pose, errors, _tuples(rows))
+        return found.with_pose(stamp_ns, place, estimate)
+
+    def with_pose(self, stamp_ns: int, place: Pose2, estimate: Estimate) -> "CalibrationFilter":
+        """With the pose of the robot's own filter, for its way until now is not known well."""
+        rows = [[0.0] * BEARING + list(row[BEARING:]) for row in self.covariance]
+        xx, xy, yy, xh, yh, hh = estimate.covariance
+        far, turned = POSITION_VARIANCE, HEADING_VARIANCE
+        rows[0] = [xx + far, xy, xh] + [0.0] * len(FIRST_SIGMAS)
+        rows[1] = [xy, yy + far, yh] + [0.0] * len(FIRST_SIGMAS)
+        rows[2] = [xh, yh, hh + turned] + [0.0] * len(FIRST_SIGMAS)
+        return self._replace(
+            stamp_ns=stamp_ns,
+            odometry_from_robot=place,
+            pose=estimate.pose,
+            covariance=_tuples(rows),
+            rejected=0,
+        )
+
+    def after(
+        self,
+        frames: Sequence[Frame],
+        noise: OdometryNoise,
+        correlation_s: float,
+        left_out: frozenset[str] = frozenset(),
+    ) -> "CalibrationFilter":
+        """The filter after these frames, in the order of time. `noise`: of the odometry;
+        `correlation_s`: of the errors of one landmark's readings; `left_out`: landmarks that are
+        not used."""
+        update = _Update(self)
+        for stamp_ns, place, seen in frames:
+            update.move(stamp_ns, place, noise)
+            for landmark in seen:
+                if landmark.name not in left_out:
+                    update.use(landmark, correlation_s)
+        return update.result()
+
+    @property
+    def scatter(self) -> float:
+        """The mean chi-square of a reading, at least 1: larger variances explain a larger one."""
+        return max(self.chi_squares / max(self.readings, 1.0), 1.0)
+
+    @property
+    def bearing_bias(self) -> tuple[float, float]:
+        """What bearings are too large by, and the sigma of that (rad)."""
+        variance = self.covariance[BEARING][BEARING]
+        return self.errors[0], sqrt(self.scatter * variance)
+
+    @property
+    def range_errors(self) -> tuple[RangeErrors, float]:
+        """Both errors of ranges, and the chi-square by which there are any (two degrees)."""
+        _, share, offset, _, _ = self.errors
+        ss, so = self.covariance[SHARE][SHARE], self.covariance[SHARE][OFFSET]
+        oo = self.covariance[OFFSET][OFFSET]
+        square = oo * share * share - 2.0 * so * share * offset + ss * offset * offset
+        return RangeErrors(share, offset), square / ((ss * oo - so * so) * self.scatter)
+
+    def share_of_range(self, one: RangeErrors, other: RangeErrors) -> float:
+        """By which share of it a range differs with both, of one of half and of one and a half of
+        the usual length the larger."""
+        usual_m = self.metres / max(self.used, 1)
+        share, offset = one.share - other.share, one.bias_m - other.bias_m
+        near, far = share + offset / (0.5 * usual_m), share + offset / (1.5 * usual_m)
+        return max(abs(near), abs(far))
+
+    def estimate_at(self, place: Pose2, before: Estimate) -> Estimate:
+        """The pose at this place by odometry, instead of that of an estimate `before`."""
+        a, b, c = self.covariance[:BEARING]
+        k = self.scatter
+        covariance = Covariance3(a[0], a[1], b[1], a[2], b[2], c[2]).scaled(k)
+        pose = self.pose @ (self.odometry_from_robot.inverse() @ place)
+        shared = covariance if any(before.shared) else before.shared
+        return Estimate(pose, covariance, shared)
+
+    def with_scales(self, distance: float, turn: float) -> "CalibrationFilter":
+        """For odometry that is corrected by these shares more than before."""
+        bearing, share, offset, by_distance, by_turn = self.errors
+        errors = bearing, share, offset, by_distance - distance, by_turn - turn
+        return self._replace(errors=errors)
+
+
+class _Update:
+    """Moves and sightings, one after the other."""
+
+    def __init__(self, before: CalibrationFilter) -> None:
+        self._before = before
+        self._stamp_ns, self._place = before.stamp_ns, before.odometry_from_robot
+        self._mean = [*before.pose, *before.errors]
+        self._rows = [list(row) for row in before.covariance]
+        self._used_ns = dict(before.used_ns)
+        self._chi_squares, self._readings = before.chi_squares, before.readings
+        self._used, self._metres, self._rejected = before.used, before.metres, before.rejected
+
+    def move(self, stamp_ns: int, place: Pose2, noise: OdometryNoise) -> None:
+        """To where the odometry has led by this time: pose' = pose + arc(errors)."""
+        seconds = (stamp_ns - self._stamp_ns) * 1e-9
+        self._stamp_ns = stamp_ns
+        rows = self._rows
+        for i, drift in enumerate(DRIFT):
+            rows[BEARING + i][BEARING + i] += drift * seconds
+        ahead, left, turn = self._place.inverse() @ place
+        self._place = place
+        mean, stretch = self._mean, 1.0 + self._mean[DISTANCE]
+        heading = mean[2]
+        direction = heading + 0.5 * mean[TURN] * turn
+        c, s = cos(direction), sin(direction)
+        dx, dy = c * ahead - s * left, s * ahead + c * left
+        # The Jacobian of the pose: by the heading, and by both scales
+        self._add_rows(0, (2, -stretch * dy), (DISTANCE, dx), (TURN, -0.5 * turn * stretch * dy))
+        self._add_rows(1, (2, stretch * dx), (DISTANCE, dy), (TURN, 0.5 * turn * stretch * dx))
+        self._add_rows(2, (TURN, turn))
+        mean[0] += stretch * dx
+        mean[1] += stretch * dy
+        mean[2] = wrap_angle(heading + (1.0 + mean[TURN]) * turn)
+        distance = sqrt(dx * dx + dy * dy)
+        along = distance_variance(distance, turn, noise, seconds)
+        around = turn_variance(distance, turn, noise)
+        cx, cy = (dx / distance, dy / distance) if distance > 0.0 else (1.0, 0.0)
+        wx, wy = -0.5 * dy, 0.5 * dx
+        added = Covariance3(
+            along * cx * cx + around * wx * wx,
+            along * cx * cy + around * wx * wy,
+            along * cy * cy + around * wy * wy,
+            around * wx,
+            around * wy,
+            around,
+        )
+        self._add_noise(added)
+
+    def _add_rows(self, to: int, *parts: tuple[int, float]) -> None:
+        """F P F^T, where F adds these multiples of other states to one. Those states may not be
+        changed by later calls of one move, but for the heading, which comes last."""
+        rows = self._rows
+        for j in range(SIZE):
+            rows[to][j] += sum([k * rows[i][j] for i, k in parts])
+        for row in rows:
+            row[to] += sum([k * row[i] for i, k in parts])
+
+    def _add_noise(self, added: Covariance3) -> None:
+        xx, xy, yy, xh, yh, hh = added
+        first, second, third = self._rows[:BEARING]
+        for row, more in ((first, (xx, xy, xh)), (second, (xy, yy, yh)), (third, (xh, yh, hh))):
+            for i, variance in enumerate(more):
+                row[i] += variance
+
+    def use(self, seen: SeenLandmark, correlation_s: float) -> None:
+        """A sighting of a landmark; not so soon after another one of it, nor one that contradicts
+        all that is known."""
+        name, x, y, range_m, bearing, range_variance, bearing_variance = seen
+        stamp_ns = self._stamp_ns
+        last_ns = self._used_ns.get(name)
+        seconds = None if last_ns is None else (stamp_ns - last_ns) * 1e-9
+        if last_ns is not None and stamp_ns - last_ns < SPACING_NS:
+            return
+        self._used_ns[name] = stamp_ns
+        factor = repetition_variance_factor(seconds, correlation_s)
+        mean = self._mean
+        dx, dy = x - mean[0], y - mean[1]
+        squared = dx * dx + dy * dy
+        distance = sqrt(squared)
+        if distance == 0.0:
+            return
+        kept = [*mean], [[*row] for row in self._rows]
+        chi_square, readings = 0.0, 0
+        if range_m is not None:
+            share = 1.0 - mean[SHARE]
+            along = -share * dx / distance, -share * dy / distance
+            row = (0, along[0]), (1, along[1]), (SHARE, -distance), (OFFSET, -1.0)
+            residual = range_m - (share * distance - mean[OFFSET])
+            chi_square += self._update(row, residual, range_variance * factor)
+            readings += 1
+        if bearing is not None:
+            # Both readings are linearized at the same pose
+            of_bearing = (0, dy / squared), (1, -dx / squared), (2, -1.0), (BEARING, 1.0)
+            before, _ = kept
+            expected = _atan2(dy, dx) - before[2] + before[BEARING]
+            residual = wrap_angle(bearing - expected)
+            residual -= sum([k * (mean[i] - before[i]) for i, k in of_bearing])
+            chi_square += self._update(of_bearing, residual, bearing_variance * factor)
+            readings += 1
+        if chi_square > GATE:
+            self._mean, self._rows = kept
+            self._rejected += 1
+            return
+        self._chi_squares = FADING * self._chi_squares + chi_square
+        self._readings = FADING * self._readings + readings
+        self._rejected = 0
+        self._used += 1
+        self._metres += distance
+
+    def _update(
+        self, row: tuple[tuple[int, float], ...], residual: float, variance: float
+    ) -> float:
+        """The update by one reading; its chi-square."""
+        mean, rows = self._mean, self._rows
+        of_reading = [sum([k * line[i] for i, k in row]) for line in rows]  # P h
+        total = variance + sum([k * of_reading[i] for i, k in row])
+        gain = [p / total for p in of_reading]
+        for i in range(SIZE):
+            mean[i] += gain[i] * residual
+            line, k = rows[i], gain[i]
+            for j in range(SIZE):
+                line[j] -= k * of_reading[j]
+        return residual * residual / total
+
+    def result(self) -> CalibrationFilter:
+        x, y, heading, *errors = self._mean
+        parts = (
+            self._stamp_ns, self._place, new(Pose2, (x, y, wrap_angle(heading))), tuple(errors),
+            _tuples(self._rows), self._used_ns, self._chi_squares, self._readings, self._used,
+            self._metres, self._rejected,
+        )  # fmt: skip
+        return new(CalibrationFilter, parts)
+
+
+Filters = Sequence[CalibrationFilter]
+"""Of one robot; each leaves out other landmarks."""
+
+
+def correction(filters: Filters, present: Adaptation) -> Adaptation | None:
+    """The settings with the errors of the sensor that are clear to each filter, and large enough to
+    be worth it; None if that changes nothing. What is corrected already follows what is known."""
+    if any(f.used < LEAST_USED or len(f.used_ns) < LEAST_LANDMARKS for f in filters):
+        return None
+    ranges = _range_errors(filters, present.ranges)
+    are_new = present.ranges == NO_RANGE_ERRORS != ranges  # what was found with wrong ones is void
+    bias_rad = _bearing_bias(filters, 0.0 if are_new else present.bearing_bias_rad)
+    changed = present._replace(bearing_bias_rad=bias_rad, ranges=ranges)
+    return None if changed == present else changed
+
+
+def _bearing_bias(filters: Filters, present_rad: float) -> float:
+    found = [f.bearing_bias for f in filters]
+    bias_rad = fmean([bias for bias, _ in found])
+    if present_rad == 0.0:
+        is_clear = all(abs(b) > SIGMAS * sigma and b * bias_rad > 0.0 for b, sigma in found)
+        return bias_rad if is_clear and LEAST_BIAS_RAD < abs(bias_rad) < MOST_BIAS_RAD else 0.0
+    is_known = all(sigma < SETTLED_RAD for _, sigma in found)
+    is_off = abs(bias_rad - present_rad) > LEAST_BIAS_AGAIN_RAD
+    return bias_rad if is_known and is_off else present_rad
+
+
+def _range_errors(filters: Filters, present: RangeErrors) -> RangeErrors:
+    found = [f.range_errors for f in filters]
+    errors = RangeErrors(
+        fmean([one.share for one, _ in found]), fmean([one.bias_m for one, _ in found])
+    )
+    share_of_range = filters[0].share_of_range
+    off = share_of_range(errors, present)
+    if present != NO_RANGE_ERRORS:
+        return errors if off > LEAST_SHARE_AGAIN else present
+    is_clear = all(chi_square > CLEAR for _, chi_square in found)
+    is_clear &= all(share_of_range(one, errors) < ALIKE * off for one, _ in found)
+    return errors if is_clear and LEAST_SHARE < off < MOST_SHARE else present
+
+
+def _tuples(rows: list[list[float]]) -> Rows:
+    return tuple([tuple(row) for row in rows])
