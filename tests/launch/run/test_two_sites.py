@@ -12,7 +12,7 @@ from cpcbl_launch.run.containers.docker import command_output
 from cpcbl_transport.zenoh_bus import open_bus
 
 WEST, EAST = {"navigator", "observer"}, {"scout", "patrol"}
-TOGETHER_WITHIN_S = 10.0  # mostly 1.3 to 2.5; TCP asks a lost SYN again after 1, 3 and 7 s
+TOGETHER_WITHIN_S = 20.0  # mostly 1.3 to 2.5; TCP asks a lost SYN again after 1, 3, 7 and 15 s
 
 
 def lengths(recorder: Recorder) -> dict[str, int]:
