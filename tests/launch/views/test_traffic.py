@@ -231,7 +231,8 @@ def test_a_running_team_is_watched_with_the_command_that_up_says(
 ) -> None:
     (tmp_path / "trio.toml").write_text(TEAM)
     monkeypatch.chdir(tmp_path)
-    options = ["--duration", "9", "--messages-per-minute", "900", "--report", "report.json"]
+    # Long enough for a watcher that starts late on a busy machine
+    options = ["--duration", "20", "--messages-per-minute", "900", "--report", "report.json"]
     command = [*PROGRAM, "up", "trio.toml", *options, "--logs", str(tmp_path / "logs")]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as up:
         assert up.stdout is not None
