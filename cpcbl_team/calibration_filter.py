@@ -24,10 +24,10 @@ from types import MappingProxyType
 from typing import Final, NamedTuple
 
 from cpcbl_team.config import OdometryNoise
-from cpcbl_team.estimate import Covariance3, Estimate
+from cpcbl_team.estimate import ZERO3, Covariance3, Estimate, Six
 from cpcbl_team.geometry import Pose2, new, wrap_angle
 from cpcbl_team.miscalibration import LEAST_BIAS_RAD, MOST_BIAS_RAD, Adaptation
-from cpcbl_team.motion import distance_variance, turn_variance
+from cpcbl_team.motion import covariance_after, distance_variance, turn_variance
 from cpcbl_team.range_errors import NO_RANGE_ERRORS, RangeErrors
 from cpcbl_team.sensors import repetition_variance_factor
 
@@ -191,7 +191,6 @@ class _Update:
     """Moves and sightings, one after the other."""
 
     def __init__(self, before: CalibrationFilter) -> None:
-        self._before = before
         self._stamp_ns, self._place = before.stamp_ns, before.odometry_from_robot
         self._mean = [*before.pose, *before.errors]
         self._rows = [list(row) for row in before.covariance]
@@ -224,16 +223,7 @@ class _Update:
         along = distance_variance(distance, turn, noise, seconds)
         around = turn_variance(distance, turn, noise)
         cx, cy = (dx / distance, dy / distance) if distance > 0.0 else (1.0, 0.0)
-        wx, wy = -0.5 * dy, 0.5 * dx
-        added = Covariance3(
-            along * cx * cx + around * wx * wx,
-            along * cx * cy + around * wx * wy,
-            along * cy * cy + around * wy * wy,
-            around * wx,
-            around * wy,
-            around,
-        )
-        self._add_noise(added)
+        self._add_noise(covariance_after(ZERO3, distance, cx, cy, along, around))
 
     def _add_rows(self, to: int, *parts: tuple[int, float]) -> None:
         """F P F^T, where F adds these multiples of other states to one. Those states may not be
@@ -244,7 +234,8 @@ class _Update:
         for row in rows:
             row[to] += sum([k * row[i] for i, k in parts])
 
-    def _add_noise(self, added: Covariance3) -> None:
+    def _add_noise(self, added: Six) -> None:
+        """Adds a covariance to that of the pose."""
         xx, xy, yy, xh, yh, hh = added
         first, second, third = self._rows[:BEARING]
         for row, more in ((first, (xx, xy, xh)), (second, (xy, yy, yh)), (third, (xh, yh, hh))):

@@ -1,7 +1,8 @@
 """What a robot knows of its own calibration while it drives, as the localizer uses it.
 
 A robot that calibrates itself (`self_calibration.py`) learns scales and a bias all the time; every
-other one changes its settings only where they are wrong (`miscalibration.py`).
+other one changes its settings only where they are wrong (`miscalibration.py`, and
+`calibration_filter.py` for what its sensor reads).
 """
 
 import math
@@ -45,7 +46,7 @@ from cpcbl_team.motion import NO_VARIANCE, MotionVariance, distance_variance, tu
 from cpcbl_team.range_errors import NO_RANGE_ERRORS
 from cpcbl_team.recovery_evidence import SPACING_NS
 from cpcbl_team.self_calibration import ReferencePose, ReferencePoses, self_calibrate
-from cpcbl_team.state import CalibrationMemory, State, with_calibration
+from cpcbl_team.state import CalibrationMemory, Evidence, State, with_calibration
 
 MOST_BEGIN_M: Final = 0.5  # sigma of a position with which the second filter begins
 
@@ -154,16 +155,10 @@ class OwnCalibration:
         if math.hypot(*moved) < LEAST_DISTANCE_M:
             return state
         field_from_odometry = state.estimate.pose @ place.inverse()
-        pieces, since_ns = list(recovery.evidence), begin.stamp_ns
-        for snapshot in recovery.snapshots:
-            if snapshot[0] > since_ns:
-                pieces += self._landmarks.evidence_of(snapshot, memory.adaptation)
         sums, k = ResidualSums(memory.residuals), 1.0 / math.sqrt(self._independent_frames)
         last_ns, here = -1, state.estimate.pose  # all pieces of a frame have one place
-        for e in pieces:
-            stamp_ns, then, name, x, y, range_m, bearing, sigma_m, sigma_rad, _, by_mate, _, _ = e
-            if stamp_ns <= since_ns or by_mate or name not in self._names_of_landmarks:
-                continue
+        for e in self._evidence_since(state, begin.stamp_ns):
+            stamp_ns, then, name, x, y, range_m, bearing, sigma_m, sigma_rad, _, _, _, _ = e
             if stamp_ns != last_ns:
                 last_ns, here = stamp_ns, field_from_odometry @ then
             here_x, here_y, heading = here
@@ -171,6 +166,18 @@ class OwnCalibration:
             sums.add(name, dx, dy, heading, range_m, bearing, k * sigma_m, k * sigma_rad)
         residuals = sums.residuals(state.estimate.covariance)
         return with_calibration(state, memory._replace(residuals=residuals))
+
+    def _evidence_since(self, state: State, since_ns: int) -> list[Evidence]:
+        """The robot's own evidence of the landmarks of the map after this time."""
+        recovery, adaptation = state.memory.recovery, state.memory.calibration.adaptation
+        pieces = list(recovery.evidence)
+        for snapshot in recovery.snapshots:
+            if snapshot[0] > since_ns:
+                pieces += self._landmarks.evidence_of(snapshot, adaptation)
+        names = self._names_of_landmarks
+        return [
+            e for e in pieces if e.stamp_ns > since_ns and e.source in names and not e.from_teammate
+        ]
 
     def _with_filters(self, state: State) -> State:
         """The state whose second filters have used the landmarks that were seen, once a block; with
@@ -223,17 +230,13 @@ class OwnCalibration:
     def _frames_since(self, state: State, since_ns: int) -> list[Frame]:
         """The landmarks that were seen after this time, as the sensor read them."""
         recovery, memory = state.memory.recovery, state.memory.calibration
-        present, pieces = memory.adaptation, list(recovery.evidence)
-        for snapshot in recovery.snapshots:
-            if snapshot[0] > since_ns:
-                pieces += self._landmarks.evidence_of(snapshot, present)
         unused = recovery.unused_objects(state.stamp_ns) | {memory.residuals.misplaced}
-        frames: dict[int, Frame] = {}
-        for e in pieces:
+        present, frames = memory.adaptation, dict[int, Frame]()
+        for e in self._evidence_since(state, since_ns):
             stamp_ns, place, name, x, y, range_m, bearing, sigma_m, sigma_rad, _, _, _, _ = e
-            if stamp_ns <= since_ns or name not in self._names_of_landmarks or name in unused:
+            if name in unused:
                 continue
-            if range_m is not None:  # pieces are corrected
+            if range_m is not None:  # evidence is corrected
                 range_m = (range_m - present.ranges.offset_m) / present.ranges.scale
             if bearing is not None:
                 bearing += present.bearing_bias_rad
@@ -294,7 +297,6 @@ class OwnCalibration:
         evidence = NO_EVIDENCE
         if errors != NO_ERRORS:
             evidence = check.evidence.without(errors)
-        if errors != NO_ERRORS:
             distance, turn, _ = errors
             memory = state.memory.calibration
             filters = tuple([f.with_scales(distance, turn) for f in memory.filters])

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from support.core import diagonal
+from support.core import EXACT, SECOND, diagonal
 
 from cpcbl_team.calibration_filter import (
     FILTERS,
@@ -18,24 +18,18 @@ from cpcbl_team.calibration_filter import (
 )
 from cpcbl_team.config import OdometryNoise
 from cpcbl_team.estimate import Estimate
-from cpcbl_team.geometry import Pose2
+from cpcbl_team.geometry import Pose2, step
 from cpcbl_team.miscalibration import AS_CONFIGURED, Adaptation
 from cpcbl_team.range_errors import RangeErrors
 
 MARKS = {"a": (0.0, 0.0), "b": (8.0, 0.0), "c": (8.0, 6.0), "d": (0.0, 6.0), "e": (4.0, 6.0)}
 START = Pose2(4.0, 1.0, 0.0)
 NOISE = OdometryNoise()
-EXACT = OdometryNoise(
-    distance_sigma_m_per_sqrt_m=1e-4,
-    turn_sigma_rad_per_sqrt_rad=1e-4,
-    turn_sigma_rad_per_sqrt_m=1e-4,
-)
 CERTAIN = OdometryNoise(
     distance_sigma_m_per_sqrt_m=0.0,
     turn_sigma_rad_per_sqrt_rad=0.0,
     turn_sigma_rad_per_sqrt_m=0.0,
 )
-PERIOD_NS = 1_000_000_000
 
 
 class Truth(NamedTuple):
@@ -78,15 +72,10 @@ def drives(
         of_way = noise.turn_sigma_rad_per_sqrt_m
         sigma_turn = math.hypot(by_rad * math.sqrt(abs(turn)), of_way * math.sqrt(ahead))
         true = ahead + by_m * math.sqrt(ahead) * rng.normal(), turn + sigma_turn * rng.normal()
-        pose = arc(pose, *true)
-        place = arc(place, ahead / (1.0 + truth.distance), turn / (1.0 + truth.turn))
-        frames.append(Frame(i * PERIOD_NS, place, seen_from(pose, truth, sensor, rng)))
+        pose = step(pose, *true)
+        place = step(place, ahead / (1.0 + truth.distance), turn / (1.0 + truth.turn))
+        frames.append(Frame(i * SECOND, place, seen_from(pose, truth, sensor, rng)))
     return frames
-
-
-def arc(pose: Pose2, distance: float, turn: float) -> Pose2:
-    c, s = math.cos(pose.heading + 0.5 * turn), math.sin(pose.heading + 0.5 * turn)
-    return Pose2(pose.x + distance * c, pose.y + distance * s, pose.heading + turn)
 
 
 def seen_from(
@@ -183,7 +172,7 @@ def test_a_robot_that_stands_finds_nothing(names: str) -> None:
         filters: Sequence[CalibrationFilter] = [start] * FILTERS
         for i in range(1, 400):
             seen = seen_from(START, Truth(), sensor, rng)
-            filters = filters_after([Frame(i * PERIOD_NS, Pose2(0.0, 0.0, 0.0), seen)], filters)
+            filters = filters_after([Frame(i * SECOND, Pose2(0.0, 0.0, 0.0), seen)], filters)
             assert correction(filters, AS_CONFIGURED) is None
 
 

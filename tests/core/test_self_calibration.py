@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.core import (
     CORNERS,
+    EXACT,
     LOOP_START,
     PROBABILISTIC,
     SECOND,
@@ -48,11 +49,6 @@ from cpcbl_team.state import CalibrationMemory, Memory, RecoveryMemory, State
 
 ORIGIN = Pose2(0.0, 0.0, 0.0)
 NOISE = OdometryNoise()
-EXACT = OdometryNoise(
-    distance_sigma_m_per_sqrt_m=1e-4,
-    turn_sigma_rad_per_sqrt_rad=1e-4,
-    turn_sigma_rad_per_sqrt_m=1e-4,
-)
 
 scales = st.floats(0.92, 1.08)
 biases = st.floats(math.radians(-3.0), math.radians(3.0))

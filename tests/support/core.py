@@ -13,6 +13,7 @@ from cpcbl_team.config import (
     Landmark,
     LocalizationSettings,
     LocalizerSettings,
+    OdometryNoise,
     OdometrySettings,
     SensorSettings,
     Start,
@@ -34,6 +35,12 @@ SECOND = 1_000_000_000
 VARIANTS: tuple[Variant, ...] = ("weighted", "circular", "oval", "joint")
 SEPARATED: tuple[Variant, ...] = ("weighted", "circular", "oval")
 PROBABILISTIC: tuple[Variant, ...] = ("circular", "oval", "joint")
+
+EXACT = OdometryNoise(
+    distance_sigma_m_per_sqrt_m=1e-4,
+    turn_sigma_rad_per_sqrt_rad=1e-4,
+    turn_sigma_rad_per_sqrt_m=1e-4,
+)
 
 CORNERS = Field(
     landmarks={

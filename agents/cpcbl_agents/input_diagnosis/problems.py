@@ -390,11 +390,11 @@ def _shift_of_landmarks(
 
 def usable(frame: Sightings) -> Sightings:
     """The frame without sightings whose numbers cannot be used."""
-    usable = [
+    kept = [
         s
         for s in frame.sightings
         if -LARGEST_ANGLE <= (s.bearing_rad or 0.0) <= LARGEST_ANGLE
         and -LARGEST_NUMBER <= (s.range_m or 0.0) <= LARGEST_NUMBER
     ]
-    is_whole = len(usable) == len(frame.sightings)
-    return frame if is_whole else Sightings(frame.stamp_ns, tuple(usable))
+    is_whole = len(kept) == len(frame.sightings)
+    return frame if is_whole else Sightings(frame.stamp_ns, tuple(kept))

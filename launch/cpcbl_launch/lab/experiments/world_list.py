@@ -201,7 +201,7 @@ def _mixed_team() -> World:
 
 
 def _miscalibrated_worlds() -> dict[str, World]:
-    """Robots whose settings are wrong; they have a minute to notice it."""
+    """Robots whose settings are wrong; they have a minute to notice it, two with a narrow view."""
     odometry, sensor = OdometrySettings(), all_robots().robots["a"].sensor
     sigmas = (
         "distance_sigma_m_per_sqrt_m",
@@ -221,17 +221,21 @@ def _miscalibrated_worlds() -> dict[str, World]:
     for name, part in truths.items():
         is_odometry = isinstance(part, OdometrySettings)
         truth = _alone(field, **{"odometry" if is_odometry else "sensor": part})
-        world = World(_alone(field), ("r",), truth=truth)
-        found[name] = world._replace(duration_s=2.0 * LEARNING_S, scored_from_s=LEARNING_S)
+        found[name] = _learning(_alone(field), truth, LEARNING_S)
     field, narrow = _field(8), replace(sensor, field_of_view_deg=60.0)
     for name, wrong in (
         ("bearings 5 deg off, view of 60 deg", replace(narrow, bearing_bias_deg=5.0)),
         ("ranges a tenth too long, view of 60 deg", replace(narrow, range_scale=1.0 / 1.1)),
     ):
-        truth = _alone(field, sensor=wrong)
-        world = World(_alone(field, sensor=narrow), ("r",), truth=truth)
-        found[name] = world._replace(duration_s=4.0 * LEARNING_S, scored_from_s=2.0 * LEARNING_S)
+        stated, truth = _alone(field, sensor=narrow), _alone(field, sensor=wrong)
+        found[name] = _learning(stated, truth, 2.0 * LEARNING_S)
     return found
+
+
+def _learning(stated: Team, truth: Team, learning_s: float) -> World:
+    """A world that is not what the team file states; the robot is scored after this time."""
+    world = World(stated, ("r",), truth=truth)
+    return world._replace(duration_s=2.0 * learning_s, scored_from_s=learning_s)
 
 
 def _uncertain_map_worlds() -> dict[str, World]:
