@@ -51,8 +51,10 @@ FADING: Final = 0.99  # of the sum of the chi-squares, a sighting
 LEAST_USED: Final = 40  # sightings
 LEAST_LANDMARKS: Final = 2
 SIGMAS: Final = 3.0  # of a bias that is believed, in each filter,
+SIGMAS_OF_SCALE: Final = 5.0  # of a scale: all filters have the odometry in common,
+SIGMAS_AGAIN: Final = 2.0  # of one that is corrected already,
 CLEAR: Final = 11.8  # and the chi-square of errors of ranges: as unlikely, with two degrees
-LEAST_SHARE: Final = 0.03  # of a range: what the first correction must be,
+LEAST_SHARE: Final = 0.03  # of a range, distance or turn: what the first correction must be,
 LEAST_SHARE_AGAIN, LEAST_BIAS_AGAIN_RAD = 0.005, math.radians(0.3)  # and others
 MOST_SHARE: Final = 0.3
 ALIKE: Final = 0.5  # by less than this part of it one filter's share differs from their mean
@@ -98,6 +100,7 @@ class CalibrationFilter(NamedTuple):
     used: int = 0  # sightings,
     metres: float = 0.0  # and the sum of their ranges
     rejected: int = 0  # in a row
+    probability: float = 0.0  # that the settings are wrong as it says (`calibration_doubt.py`)
 
     @staticmethod
     def at(stamp_ns: int, place: Pose2, estimate: Estimate) -> "CalibrationFilter":
@@ -307,7 +310,7 @@ class _Update:
         parts = (
             self._stamp_ns, self._place, new(Pose2, (x, y, wrap_angle(heading))), tuple(errors),
             _tuples(self._rows), self._used_ns, self._chi_squares, self._readings, self._used,
-            self._metres, self._rejected,
+            self._metres, self._rejected, 0.0,
         )  # fmt: skip
         return new(CalibrationFilter, parts)
 
@@ -317,15 +320,33 @@ Filters = Sequence[CalibrationFilter]
 
 
 def correction(filters: Filters, present: Adaptation) -> Adaptation | None:
-    """The settings with the errors of the sensor that are clear to each filter, and large enough to
-    be worth it; None if that changes nothing. What is corrected already follows what is known."""
+    """The settings with the errors that are clear to each filter, and large enough to be worth it;
+    None if that changes nothing. What is corrected already follows what is known."""
     if any(f.used < LEAST_USED or len(f.used_ns) < LEAST_LANDMARKS for f in filters):
         return None
     ranges = _range_errors(filters, present.ranges)
     are_new = present.ranges == NO_RANGE_ERRORS != ranges  # what was found with wrong ones is void
     bias_rad = _bearing_bias(filters, 0.0 if are_new else present.bearing_bias_rad)
-    changed = present._replace(bearing_bias_rad=bias_rad, ranges=ranges)
+    changed = present._replace(
+        distance_scale=_scale(filters, DISTANCE, present.distance_scale),
+        turn_scale=_scale(filters, TURN, present.turn_scale),
+        bearing_bias_rad=bias_rad,
+        ranges=ranges,
+    )
     return None if changed == present else changed
+
+
+def _scale(filters: Filters, state: int, present: float) -> float:
+    """Of distances or turns. What the filters find is what is left of its error."""
+    found = [
+        (f.errors[state - BEARING], sqrt(f.scatter * f.covariance[state][state])) for f in filters
+    ]
+    error, is_first = fmean([e for e, _ in found]), present == 1.0
+    sigmas, least = (
+        (SIGMAS_OF_SCALE, LEAST_SHARE) if is_first else (SIGMAS_AGAIN, LEAST_SHARE_AGAIN)
+    )
+    is_clear = all(abs(e) > sigmas * sigma and e * error > 0.0 for e, sigma in found)
+    return present * (1.0 + error) if is_clear and least < abs(error) < MOST_SHARE else present
 
 
 def _bearing_bias(filters: Filters, present_rad: float) -> float:

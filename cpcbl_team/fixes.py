@@ -12,7 +12,7 @@ from msgspec.structs import replace
 from cpcbl_team.arcs import arc_variance
 from cpcbl_team.common_errors import CommonErrors
 from cpcbl_team.config import SensorSettings
-from cpcbl_team.estimate import Estimate
+from cpcbl_team.estimate import Covariance3, Estimate
 from cpcbl_team.fusion import Observation
 from cpcbl_team.gaussian import Covariance2, Gaussian2, sighting_gaussian
 from cpcbl_team.geometry import Pose2, wrap_angle
@@ -23,9 +23,27 @@ from cpcbl_team.state import FIX
 POSITION_SENSOR = "position sensor"
 EARLIER_NS = 1_000_000_000  # since an earlier fix, in which a teammate does not get far
 MOST_SHIFT = 0.25  # of a range; a Gaussian does not describe what is less certain
+MEAN_S = 0.3  # over which the place of a teammate is a mean
 _NOTHING = Covariance2(0.0, 0.0, 0.0)
 _AXES = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
 _HEADING = ((0.0, 0.0, 1.0),)
+
+
+class MeanPlace(NamedTuple):
+    """Where a teammate was seen of late, in the field's frame (m)."""
+
+    stamp_ns: int
+    x: float
+    y: float
+
+
+def mean_place(before: MeanPlace | None, fix: Fix) -> MeanPlace:
+    """The place with this fix, too: an exponential mean."""
+    if before is None or fix.stamp_ns - before.stamp_ns > EARLIER_NS:
+        return MeanPlace(fix.stamp_ns, fix.x_m, fix.y_m)
+    k = -math.expm1(-max(fix.stamp_ns - before.stamp_ns, 0) * 1e-9 / MEAN_S)
+    x, y = before.x + k * (fix.x_m - before.x), before.y + k * (fix.y_m - before.y)
+    return MeanPlace(fix.stamp_ns, x, y)
 
 
 def fix_for(
@@ -34,7 +52,7 @@ def fix_for(
     estimate: Estimate,
     sighting: Sighting,
     sensor: SensorSettings,
-    earlier: Fix | None = None,
+    earlier: MeanPlace | None = None,
     common: CommonErrors | None = None,
 ) -> Fix | None:
     """The fix of the robot that `observer` saw; None if range or bearing is missing or unusable.
@@ -44,9 +62,13 @@ def fix_for(
     field_from_observer with the sighting. An uncertain heading bends the line of sight to an arc,
     which J does not know: its variance along the line of sight is added to the observer's part. A
     heading of the teammate is the observer's plus the one in its frame, and so are their variances.
-    The sigma is a share of the range to an `earlier` fix: that one errs apart from this reading.
-    The position is not that of the reading itself, but see `unbiased_range_m`. The constant errors
-    of the observer's camera (`common`) are part of the observer's error.
+    The covariances are those at the place of `earlier` fixes, for that errs apart from this
+    reading: of an ellipse that is turned by the very error of its reading, and of a sigma that is a
+    share of it, repeated fixes are a biased choice (S. Bordonaro, P. Willett, Y. Bar-Shalom,
+    Decorrelated unbiased converted measurement Kalman filter, IEEE Transactions on Aerospace and
+    Electronic Systems, 2014). The position is not that of the reading itself, but see
+    `unbiased_range_m`. The constant errors of the observer's camera (`common`) are part of the
+    observer's error.
     """
     range_m, bearing = sighting.range_m, sighting.bearing_rad
     if range_m is None or bearing is None or sighting_fault(sighting):
@@ -54,19 +76,16 @@ def fix_for(
     if range_m > sensor.max_range_for_range_m:  # only its bearing is good enough
         return None
     pose, covariance = estimate.pose, estimate.covariance
-    expected_m = None
-    if earlier is not None and stamp_ns - earlier.stamp_ns <= EARLIER_NS:
-        expected_m = math.hypot(earlier.x_m - pose.x, earlier.y_m - pose.y)
-    sighted = _sighted_gaussian(sighting, range_m, bearing, sensor, expected_m)
+    if earlier is not None and stamp_ns - earlier.stamp_ns > EARLIER_NS:
+        earlier = None
+    sighted, toward = _sighted_gaussian(sighting, range_m, bearing, sensor, pose, earlier)
     x, y = pose.transform(sighted.x, sighted.y)
     rotated = sighted.covariance.rotated(pose.heading)
-    jacobian = (1.0, 0.0, pose.y - y, 0.0, 1.0, x - pose.x, 0.0, 0.0, 0.0)
-    arc, dx, dy = arc_variance(covariance.hh), x - pose.x, y - pose.y
-    observer_part = covariance.transformed(jacobian).position()
-    observer_part += Covariance2(arc * dx * dx, arc * dx * dy, arc * dy * dy)
-    turned = covariance.hh
+    distance, direction = math.hypot(sighted.x, sighted.y), pose.heading + toward
+    dx, dy = distance * math.cos(direction), distance * math.sin(direction)
+    observer_part, turned = _observer_part(covariance, dx, dy), covariance.hh
     if common is not None:
-        observer_part += common.of_point(dx, dy, bearing)
+        observer_part += common.of_point(dx, dy, toward)
         turned += common.of_heading(sighting)
     fix = Fix(sighting.id, observer, stamp_ns, x, y, rotated, observer_part)
     heading, heading_sigma = sighting.heading_rad, sighting.heading_sigma_rad
@@ -80,21 +99,39 @@ def fix_for(
     )
 
 
+def _observer_part(covariance: Covariance3, dx: float, dy: float) -> Covariance2:
+    """What the observer's pose adds to the covariance of a point that is so far from it (m, in the
+    field's frame)."""
+    jacobian = (1.0, 0.0, -dy, 0.0, 1.0, dx, 0.0, 0.0, 0.0)
+    arc = arc_variance(covariance.hh)
+    by_pose = covariance.transformed(jacobian).position()
+    return by_pose + Covariance2(arc * dx * dx, arc * dx * dy, arc * dy * dy)
+
+
 def _sighted_gaussian(
     sighting: Sighting,
     range_m: float,
     bearing: float,
     sensor: SensorSettings,
-    expected_m: float | None,
-) -> Gaussian2:
-    """The teammate in the observer's frame; `expected_m`: the range by an earlier fix."""
-    range_sigma, bearing_sigma = sighting_sigmas(sighting, sensor, expected_m)
-    of_reading = expected_m is None and sighting.range_sigma_m is None
-    share = sensor.range_share if of_reading else 0.0
-    mean_m = unbiased_range_m(range_m, range_sigma, bearing_sigma, share)
-    along_m = math.hypot(range_sigma, range_m * arc_width(bearing_sigma))
-    _, _, covariance = sighting_gaussian(range_m, bearing, along_m, bearing_sigma)
-    return Gaussian2(mean_m * math.cos(bearing), mean_m * math.sin(bearing), covariance)
+    pose: Pose2,
+    earlier: MeanPlace | None,
+) -> tuple[Gaussian2, float]:
+    """The teammate in the observer's frame, and the bearing (rad) at which its covariance is."""
+    if earlier is None:
+        range_sigma, bearing_sigma = sighting_sigmas(sighting, sensor)
+        share = sensor.range_share if sighting.range_sigma_m is None else 0.0
+        mean_m = unbiased_range_m(range_m, range_sigma, bearing_sigma, share)
+        along_m = math.hypot(range_sigma, range_m * arc_width(bearing_sigma))
+        toward = bearing
+    else:
+        x, y = pose.inverse().transform(earlier.x, earlier.y)
+        range_sigma, bearing_sigma = sighting_sigmas(sighting, sensor, math.hypot(x, y))
+        mean_m = range_m * min(math.exp(0.5 * bearing_sigma**2), 1.0 + MOST_SHIFT)
+        # Of the error across, a share as large as the error of the direction is along it
+        along_m = math.hypot(range_sigma, range_m * bearing_sigma**2)
+        toward = math.atan2(y, x)
+    _, _, covariance = sighting_gaussian(range_m, toward, along_m, bearing_sigma)
+    return Gaussian2(mean_m * math.cos(bearing), mean_m * math.sin(bearing), covariance), toward
 
 
 def unbiased_range_m(

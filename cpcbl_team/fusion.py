@@ -14,6 +14,7 @@ from typing import NamedTuple
 from cpcbl_team.estimate import (
     HEADING,
     POSE,
+    POSITION,
     SHARPEST_VARIANCE,
     SMALLEST_VARIANCE,
     ZERO3,
@@ -124,6 +125,7 @@ def merge_naive(prior: Estimate, observation: Observation, scope: Scope = POSE) 
 
 
 _GOLDEN = 0.6180339887498949
+WIDE_RAD = math.radians(10.0)  # sigma of a heading
 
 
 def merge_split(prior: Estimate, observation: Observation, scope: Scope = POSE) -> Estimate:
@@ -141,7 +143,13 @@ def merge_split(prior: Estimate, observation: Observation, scope: Scope = POSE) 
     weight, extent = best_weight(goal)
     if extent >= _size(prior.covariance, scope):
         return prior
-    return _merge_with_weight(prior, observation, scope, weight)
+    merged = _merge_with_weight(prior, observation, scope, weight)
+    is_wider = scope is POSE and merged.covariance.hh > prior.covariance.hh > WIDE_RAD**2
+    if not is_wider or any(a for _, _, a in observation.rows):
+        return merged
+    # A position would be paid for with the heading, until the robot has none
+    apart = merge_split(with_all_shared(prior), observation, POSITION)
+    return apart if apart.covariance.determinant() < extent else merged
 
 
 def best_weight(objective: Callable[[float], float]) -> tuple[float, float]:

@@ -9,6 +9,7 @@ import math
 from collections.abc import Sequence
 from typing import Final
 
+from cpcbl_team.calibration_doubt import with_probabilities
 from cpcbl_team.calibration_filter import (
     FILTERS,
     LONGEST_NS,
@@ -188,11 +189,16 @@ class OwnCalibration:
         present = memory.adaptation
         changed = correction(filters, present)
         if changed is None:
+            filters = with_probabilities(filters, present)
             return with_calibration(state, memory._replace(filters=filters))
         is_first = present.bearing_bias_rad == 0.0 != changed.bearing_bias_rad
         is_first |= present.ranges == NO_RANGE_ERRORS != changed.ranges
         if not is_first:
-            return with_calibration(state, memory._replace(filters=filters, adaptation=changed))
+            is_new = errors_between(AS_CONFIGURED, present) == NO_ERRORS
+            check = memory.check.restarted(state.updates.accepted)
+            memory = memory._replace(filters=filters, check=check)
+            state = _with_adaptation(with_calibration(state, memory), changed)
+            return state.counted("miscalibrated") if is_new else state
         # What was found with the errors is void, the pose and other changes of the settings too
         place, estimate = state.odometry_from_robot, state.estimate
         distance, turn, _ = errors_between(present, AS_CONFIGURED)
@@ -283,24 +289,18 @@ class OwnCalibration:
 
     def _after_judgement(self, state: State, check: ModelCheck, now: Corrected) -> State:
         """The state at the end of a block, after which there are enough to judge the settings."""
-        present, accepted = state.memory.calibration.adaptation, state.updates.accepted
+        memory, accepted = state.memory.calibration, state.updates.accepted
+        present = memory.adaptation
         changed = adapted(check, present, accepted, self._rules)
         doubts = doubts_of(check, present, changed or present, self._rules.independent_share)
         check = check._replace(doubts=doubts)
         if changed is None:
             return self._with_check(state, check, present)
-        errors = errors_between(present, changed)
-        pose = offset_pose(state.estimate.pose, pose_offset(check.sensitivity, errors), POSE)
-        state = state._replace(estimate=state.estimate._replace(pose=pose))
+        is_corrected = errors_between(present, changed) != NO_ERRORS
+        state = _with_adaptation(with_calibration(state, memory._replace(check=check)), changed)
         now = now._replace(estimate=state.estimate)
         # Other sigmas whiten otherwise: what was collected with the old ones is void
-        evidence = NO_EVIDENCE
-        if errors != NO_ERRORS:
-            evidence = check.evidence.without(errors)
-            distance, turn, _ = errors
-            memory = state.memory.calibration
-            filters = tuple([f.with_scales(distance, turn) for f in memory.filters])
-            state = with_calibration(state, memory._replace(filters=filters))
+        evidence = state.memory.calibration.check.evidence if is_corrected else NO_EVIDENCE
         check = ModelCheck(
             now, check.sensitivity, evidence, 0, "", accepted, doubts, (), now.stamp_ns
         )
@@ -311,3 +311,19 @@ class OwnCalibration:
         learned, references, total_turn_rad, _, _, *others = memory
         parts = learned, references, total_turn_rad, check, present, *others
         return with_calibration(state, new(CalibrationMemory, parts))
+
+
+def _with_adaptation(state: State, changed: Adaptation) -> State:
+    """The state with other settings: the pose, and what was collected, as if they had been so all
+    the time."""
+    memory = state.memory.calibration
+    check, errors = memory.check, errors_between(memory.adaptation, changed)
+    pose = offset_pose(state.estimate.pose, pose_offset(check.sensitivity, errors), POSE)
+    distance, turn, _ = errors
+    memory = memory._replace(
+        check=check._replace(evidence=check.evidence.without(errors)),
+        adaptation=changed,
+        filters=tuple([f.with_scales(distance, turn) for f in memory.filters]),
+    )
+    state = state._replace(estimate=state.estimate._replace(pose=pose))
+    return with_calibration(state, memory)

@@ -12,6 +12,7 @@ from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from cpcbl_team.arcs import with_arc_width
+from cpcbl_team.calibration_doubt import with_doubt
 from cpcbl_team.calibration_filter import CalibrationFilter
 from cpcbl_team.common_errors import CommonErrors
 from cpcbl_team.config import Field, Start
@@ -169,8 +170,7 @@ class TeammateMemory(NamedTuple):
 
 
 class CalibrationMemory(NamedTuple):
-    """What a self-calibrating robot has learned, and what it compares next; what every robot
-    notices of its calibration, and what it changes."""
+    """What a robot has learned and noticed of its calibration, and what it compares next."""
 
     learned: SelfCalibration = SelfCalibration()
     references: ReferencePoses | None = None
@@ -185,10 +185,8 @@ class CalibrationMemory(NamedTuple):
     residuals: MapResiduals = MapResiduals()
     unplaced: Mapping[str, tuple[LandmarkReading, ...]] = _NONE
     """What was read of landmarks whose places are not known yet."""
-    innovations: Innovations = _NONE
-    """Of landmarks whose places the robot has found itself,"""
-    moved: Moves = _NONE
-    """and those of them that moved since then."""
+    innovations: Innovations = _NONE  # of landmarks whose places the robot has found itself,
+    moved: Moves = _NONE  # and those of them that moved since then
     stationary: StationaryRecord | None = None  # None while it drives
 
     @property
@@ -238,7 +236,9 @@ class State(NamedTuple):
     @property
     def reported(self) -> Estimate:
         """The estimate as it is belief to others: as uncertain as the settings are, too."""
-        return with_doubts(with_arc_width(self.estimate), self.memory.calibration.check)
+        known = self.memory.calibration
+        estimate = with_doubts(with_arc_width(self.estimate), known.check)
+        return with_doubt(estimate, self.odometry_from_robot, known.filters)
 
     @property
     def common_errors(self) -> CommonErrors | None:

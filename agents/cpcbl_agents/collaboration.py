@@ -20,7 +20,7 @@ from cpcbl_agents.message_counters import MessageCounters
 from cpcbl_agents.teammate_frames import TeammateFrames
 from cpcbl_team import information_gain as gains
 from cpcbl_team.config import LocalizationSettings
-from cpcbl_team.fixes import fix_for, with_sensor_factor, without_heading
+from cpcbl_team.fixes import MeanPlace, fix_for, mean_place, with_sensor_factor, without_heading
 from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.information_gain import FixMemory, HeadingMemory
 from cpcbl_team.inputs import Belief, Fix, HeadingBelief, LandmarkBelief
@@ -73,6 +73,7 @@ class CollaborationAgent:
         self._belief_ns = start_ns
         self._track_ns = -1
         self._latest_fixes: dict[str, Fix] = {}
+        self._places: dict[str, MeanPlace] = {}  # by all of its fixes
         self._early_fixes: dict[str, Fix] = {}  # of robots whose tier is not known yet
         self._fix_memories: dict[str, tuple[int, FixMemory]] = {}
         self._needs: dict[str, gains.Need] = {}
@@ -151,7 +152,7 @@ class CollaborationAgent:
         """Forgets what holds in the former frame alone."""
         self.frames.begin_frame(frame)
         self.landmarks.begin_frame()
-        self._latest_fixes, self._early_fixes, self._fix_memories = {}, {}, {}
+        self._latest_fixes, self._places, self._early_fixes, self._fix_memories = {}, {}, {}, {}
         self._needs, self._last_belief, self._heading_sources = {}, None, frozenset()
         self.sources, self.tier = frozenset(), LOWEST_TIER
 
@@ -179,6 +180,7 @@ class CollaborationAgent:
             for name, fix in self._latest_fixes.items()
             if fix.stamp_ns > forgotten_ns and (name in self._teammates or name in guests)
         }
+        self._places = {name: self._places[name] for name in self._latest_fixes}
         early = self._early_fixes.items()
         self._early_fixes = {name: fix for name, fix in early if fix.stamp_ns > forgotten_ns}
         self.neighbours = guests.union(self._latest_fixes)
@@ -224,12 +226,12 @@ class CollaborationAgent:
         for s in seen.frame.sightings:
             if s.id not in self._teammates and not self.guests.notice(s.id, stamp_ns):
                 continue
-            earlier = self._latest_fixes.get(s.id)
+            earlier = self._places.get(s.id)
             fix = fix_for(self._robot, stamp_ns, seen.estimate, s, sensor, earlier, seen.common)
             if fix is None:
                 continue
             fix = with_sensor_factor(fix, seen.sensor_factor)
-            self._latest_fixes[fix.robot] = fix
+            self._latest_fixes[s.id], self._places[s.id] = fix, mean_place(earlier, fix)
             if seen.lost or self.may_mislead:
                 continue
             if fix.robot in self.frames.tiers:

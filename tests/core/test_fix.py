@@ -24,9 +24,12 @@ from cpcbl_team.estimate import Estimate
 from cpcbl_team.fixes import (
     arc_width,
     fix_for,
+    from_fix,
+    mean_place,
     unbiased_range_m,
     without_heading,
 )
+from cpcbl_team.fusion import mark_shared, merge_split
 from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.geometry import Pose2
 from cpcbl_team.inputs import Fix, Sighting
@@ -121,18 +124,76 @@ def test_fixes_that_repeat_do_not_pull_a_teammate(
     robot = localizer("joint", Field(), odometry=stands, collaboration=FORMULAS)
     errors = []
     for seed in range(40):
-        rng, fix = np.random.default_rng(seed), None
+        rng, place = np.random.default_rng(seed), None
         state = state_at(Pose2(3.3, 0.0, 0.0), diagonal(0.5, 0.1))
         for i in range(1, 101):
             read = 3.3 * (1.0 + share * rng.normal()), math.radians(sigma_deg) * rng.normal()
             stamp_ns = int(i * interval_s * SECOND)
-            fix = fix_for("mate", stamp_ns, here, Sighting("me", *read), sensor, fix)
+            fix = fix_for("mate", stamp_ns, here, Sighting("me", *read), sensor, place)
             assert fix is not None
+            place = mean_place(place, fix)
             state = robot.add_fix(state, fix)
         estimate = state.estimate
         errors.append((estimate.pose.x - 3.3) / math.sqrt(estimate.covariance.xx))
     assert abs(np.mean(errors)) < 0.4
     assert np.std(errors) < 1.3
+
+
+@pytest.mark.parametrize("rate_hz", [5.0, 20.0])
+def test_no_fixes_are_chosen_by_their_own_errors(rate_hz: float) -> None:
+    """A standing observer with a wide bearing helps a standing teammate whose estimate may hold all
+    of the observer's error. Of many fixes covariance intersection takes those that make its
+    covariance smaller: if the axes of each were turned by its own error, those would be the wrong
+    ones (NEES 63 of 2 with 20 Hz)."""
+    sensor = replace(SENSOR, range_share=0.01, range_floor_m=0.01, bearing_sigma_deg=5.0)
+    squares = []
+    for seed in range(20):
+        rng, place = np.random.default_rng(seed), None
+        off, (x, y) = math.radians(0.5) * rng.normal(), 0.05 * rng.normal(size=2)
+        observer = Estimate(Pose2(-3.4, 0.0, off), diagonal(1e-3, math.radians(0.5)))
+        known = Estimate(Pose2(x, y, 0.0), diagonal(0.05, 0.05))
+        for i in range(int(40.0 * rate_hz)):
+            read = 3.4 * (1.0 + 0.01 * rng.normal()), math.radians(5.0) * rng.normal()
+            stamp_ns = int(i / rate_hz * SECOND)
+            fix = fix_for("mate", stamp_ns, observer, Sighting("me", *read), sensor, place)
+            assert fix is not None
+            place = mean_place(place, fix)
+            known = merge_split(mark_shared(known), from_fix(fix).of_position(known.pose))
+        error = np.array([known.pose.x, known.pose.y])
+        squares.append(error @ np.linalg.solve(matrix2(known.covariance.position()), error))
+    assert np.mean(squares) < 3.5
+
+
+def test_a_position_is_not_paid_for_with_the_heading() -> None:
+    """Each report of a teammate that may have errors in common with a robot inflates what is known
+    already. A heading of 30° would be one of 60° after some seconds, and the robot lost."""
+    observer = Estimate(Pose2(-3.0, 0.0, 0.0), diagonal(1e-3, math.radians(0.5)))
+    for seed in range(10):
+        rng, place = np.random.default_rng(seed), None
+        x, y = 0.5 * rng.normal(size=2)
+        known = Estimate(Pose2(x, y, 0.3), diagonal(0.5, math.radians(30.0)))
+        for i in range(100):
+            read = 3.0 + 0.1 * rng.normal(), math.radians(3.0) * rng.normal()
+            fix = fix_for("mate", i * SECOND // 10, observer, Sighting("me", *read), SENSOR, place)
+            assert fix is not None
+            place = mean_place(place, fix)
+            known = merge_split(mark_shared(known), from_fix(fix).of_position(known.pose))
+        assert known.heading_sigma_rad < math.radians(33.0)
+        assert known.position_sigma_m < 0.08
+        error = np.array([known.pose.x, known.pose.y])
+        assert error @ np.linalg.solve(matrix2(known.covariance.position()), error) < 14.0
+
+
+def test_the_place_of_a_teammate_is_a_mean() -> None:
+    fix = observed(Sighting("me", 3.0, 0.0), an_observer(0))
+    assert fix is not None
+    place = mean_place(None, fix)
+    assert place == (fix.stamp_ns, fix.x_m, fix.y_m)
+    later = replace(fix, stamp_ns=fix.stamp_ns + SECOND // 10, x_m=fix.x_m + 1.0)
+    assert mean_place(place, later).x == pytest.approx(fix.x_m - math.expm1(-1.0 / 3.0))
+    assert mean_place(place, replace(later, stamp_ns=fix.stamp_ns - 1)).x == fix.x_m  # a late frame
+    much_later = replace(later, stamp_ns=fix.stamp_ns + 2 * SECOND)
+    assert mean_place(place, much_later).x == much_later.x_m
 
 
 def test_a_fix_from_a_turned_observer_is_within_its_sigma() -> None:

@@ -1,0 +1,126 @@
+"""A robot whose settings seem to be wrong is less certain until it knows, and no other robot is."""
+
+import math
+
+import numpy as np
+import pytest
+from core.test_calibration_filter import MARKS, NOISE, Sensor, Truth, drives, started
+from support.core import diagonal
+
+from cpcbl_team.calibration_doubt import ODDS, with_doubt, with_probabilities
+from cpcbl_team.calibration_filter import FILTERS, FIRST_SIGMAS, CalibrationFilter
+from cpcbl_team.estimate import Covariance3, Estimate
+from cpcbl_team.geometry import Pose2
+from cpcbl_team.miscalibration import AS_CONFIGURED, Adaptation
+from cpcbl_team.range_errors import RangeErrors
+
+TWO = Sensor(names="ac")  # of which each second filter but one sees both
+HERE = Pose2(0.0, 0.0, 0.0)
+
+
+def density(off: np.ndarray, covariance: np.ndarray) -> float:
+    """Of a Gaussian."""
+    square = off @ np.linalg.solve(covariance, off)
+    return float(math.exp(-0.5 * square) / math.sqrt(np.linalg.det(2.0 * math.pi * covariance)))
+
+
+def knowing(errors: np.ndarray, covariance: np.ndarray, pose: Pose2 = HERE) -> CalibrationFilter:
+    """A filter that knows this of the bias of bearings and of both errors of ranges."""
+    rows = np.diag([1.0] * 8)
+    rows[:3, :3], rows[3:6, 3:6] = 0.01 * np.eye(3), covariance
+    return CalibrationFilter(
+        0, HERE, pose, (*map(float, errors), 0.0, 0.0), tuple(map(tuple, rows))
+    )
+
+
+def filters_over_time(
+    truth: Truth, seed: int, sensor: Sensor, steps: int
+) -> list[tuple[CalibrationFilter, ...]]:
+    frames, names = drives(truth, seed, sensor, steps=steps), sorted(MARKS)
+    filters, found = [started()] * FILTERS, []
+    for i in range(0, len(frames), 3):
+        filters = [
+            f.after(frames[i : i + 3], NOISE, 0.0, frozenset(names[n::FILTERS]))
+            for n, f in enumerate(filters)
+        ]
+        found.append(with_probabilities(tuple(filters), AS_CONFIGURED))
+    return found
+
+
+def probability(filters: tuple[CalibrationFilter, ...]) -> float:
+    return sum(f.probability for f in filters)
+
+
+def test_probabilities_are_those_of_bayes() -> None:
+    """By the densities of errors that are zero (Dickey 1971), before and after the sightings."""
+    errors, first = np.array([0.1, 0.08, -0.05]), np.diag(np.square(FIRST_SIGMAS[:3]))
+    root = np.array([[0.03, 0.0, 0.0], [0.01, 0.02, 0.0], [0.02, -0.01, 0.05]])
+    after, zero = root @ root.T, np.zeros(3)
+    by_all = density(zero, first) / density(errors, after)
+    by_bias = density(zero[:1], first[:1, :1]) / density(errors[:1], after[:1, :1])
+    assert by_all > 1.0
+    assert by_bias > 1.0
+    odds = ODDS * (by_all - 1.0 + by_bias - 1.0)
+    (found,) = with_probabilities((knowing(errors, after),), AS_CONFIGURED)
+    assert found.probability == pytest.approx(odds / (1.0 + odds))
+
+
+def test_errors_that_are_corrected_are_not_doubted() -> None:
+    errors, after = np.array([0.1, 0.08, -0.05]), 1e-4 * np.eye(3)
+    corrected = Adaptation(bearing_bias_rad=0.1, ranges=RangeErrors(0.08, -0.05))
+    filters = (knowing(errors, after),) * FILTERS
+    assert probability(with_probabilities(filters, AS_CONFIGURED)) == pytest.approx(1.0)
+    assert probability(with_probabilities(filters, corrected)) == 0.0
+
+
+def test_rounding_is_no_evidence() -> None:
+    """Of errors that one reading ties together nothing is known but their sum."""
+    together = 1e-4 * np.ones((3, 3)) - 1e-20 * np.eye(3)
+    (found,) = with_probabilities((knowing(np.zeros(3), together),), AS_CONFIGURED)
+    assert found.probability == 0.0
+
+
+def test_the_covariance_is_that_of_the_mixture() -> None:
+    """By samples of it."""
+    rng, near, far = np.random.default_rng(0), 0.1 * np.eye(3), np.diag([0.2, 0.05, 0.1])
+    poses = [Pose2(1.0, 2.0, 3.0), Pose2(1.5, 2.0, -3.1)]
+    one, other = (knowing(np.zeros(3), far, pose)._replace(probability=0.2) for pose in poses)
+    estimate = Estimate(Pose2(1.0, 2.5, 3.1), Covariance3(0.1, 0.0, 0.1, 0.0, 0.0, 0.1))
+    n = 100_000
+    at = [rng.multivariate_normal([0.0, 0.0, 0.0], near, 3 * n)]
+    for pose in poses:
+        x, y, heading = pose
+        off = x - 1.0, y - 2.5, math.remainder(heading - 3.1, math.tau)
+        at.append(rng.multivariate_normal(off, 0.01 * np.eye(3), n))
+    moments = np.concatenate(at)
+    wanted = moments.T @ moments / len(moments)
+    xx, xy, yy, xh, yh, hh = with_doubt(estimate, HERE, (one, other)).covariance
+    found = np.array([[xx, xy, xh], [xy, yy, yh], [xh, yh, hh]])
+    assert found == pytest.approx(wanted, abs=0.003)
+
+
+def test_without_doubt_the_estimate_is_as_it_was() -> None:
+    estimate = Estimate(HERE, diagonal(0.1, 0.1))
+    assert with_doubt(estimate, HERE, ()) is estimate
+    assert with_doubt(estimate, HERE, (started(),)) is estimate
+
+
+@pytest.mark.parametrize("names", ["abcde", "ac", "e"])
+def test_right_settings_are_hardly_doubted(names: str) -> None:
+    means = []
+    for seed in range(6):
+        found = filters_over_time(Truth(), seed, Sensor(names=names), 240)
+        means.append(np.mean([probability(filters) for filters in found]))
+    assert np.mean(means) < 0.03
+    assert max(means) < 0.15
+
+
+@pytest.mark.parametrize(
+    "truth",
+    [Truth(bearing=math.radians(8.0)), Truth(share=0.1), Truth(share=-0.1), Truth(offset_m=0.25)],
+)
+def test_wrong_settings_are_doubted_with_two_landmarks(truth: Truth) -> None:
+    """With so few nothing is corrected; but the robot is no longer certain of its pose."""
+    for seed in range(3):
+        found = filters_over_time(truth, seed, TWO, 300)
+        assert probability(found[-1]) > 0.9
