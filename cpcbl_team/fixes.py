@@ -64,9 +64,8 @@ def fix_for(
     heading of the teammate is the observer's plus the one in its frame, and so are their variances.
     The covariances are those at the place of `earlier` fixes, for that errs apart from this
     reading: of an ellipse that is turned by the very error of its reading, and of a sigma that is a
-    share of it, repeated fixes are a biased choice (S. Bordonaro, P. Willett, Y. Bar-Shalom,
-    Decorrelated unbiased converted measurement Kalman filter, IEEE Transactions on Aerospace and
-    Electronic Systems, 2014). The position is not that of the reading itself, but see
+    share of it, repeated fixes are a biased choice (Bordonaro, Willett, Bar-Shalom, Decorrelated
+    unbiased converted measurement Kalman filter, IEEE Trans. AES, 2014). The position is not that of the reading itself, but see
     `unbiased_range_m`. The constant errors of the observer's camera (`common`) are part of the
     observer's error.
     """
@@ -81,8 +80,8 @@ def fix_for(
     sighted, toward = _sighted_gaussian(sighting, range_m, bearing, sensor, pose, earlier)
     x, y = pose.transform(sighted.x, sighted.y)
     rotated = sighted.covariance.rotated(pose.heading)
-    distance, direction = math.hypot(sighted.x, sighted.y), pose.heading + toward
-    dx, dy = distance * math.cos(direction), distance * math.sin(direction)
+    distance = math.hypot(sighted.x, sighted.y)
+    dx, dy = distance * math.cos(pose.heading + toward), distance * math.sin(pose.heading + toward)
     observer_part, turned = _observer_part(covariance, dx, dy), covariance.hh
     if common is not None:
         observer_part += common.of_point(dx, dy, toward)
