@@ -56,7 +56,7 @@ def test_a_recording_ends_where_its_disk_is_full_and_nobody_notices(
 
 
 def test_a_run_on_a_full_disk_goes_on_to_its_report() -> None:
-    ran = cpcbl_team("up", "--duration", 2, "--report", FULL, "--json")
+    ran = cpcbl_team("up", "--robots", "observer", "--duration", 2, "--report", FULL, "--json")
     assert ran.returncode == 1
     assert set(json.loads(ran.stdout)["robots"]) == {"navigator", "observer", "scout", "patrol"}
     assert ran.stderr.splitlines()[-1] == f"cpcbl-team: /dev/full: not written: {NO_SPACE}"
