@@ -1,5 +1,6 @@
 """What holds for every test: none is timed, and no process that it started outlives it."""
 
+import gc
 import logging
 import os
 import signal
@@ -38,6 +39,16 @@ def pytest_configure() -> None:
     if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:
         signal.signal(signal.SIGHUP, lambda number, frame: None)
     adopt_orphans()
+
+
+def pytest_collection() -> None:
+    """Does not look for garbage while thousands of tests are found, nor ever again among them."""
+    gc.disable()
+
+
+def pytest_collection_finish() -> None:
+    gc.enable()
+    gc.freeze()
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -31,6 +31,8 @@ SAMPLES = 4  # of a pixel, along a side, around the landmark
 MARGIN_PX = 16
 LEVELS = 5  # of the pyramid of the floor's picture
 CAP = (0.05, 0.05, 0.05)  # the top face of a landmark
+_SHARE = np.arange(256).astype(np.float32) / 255.0
+_LINEAR = np.where(_SHARE <= 0.04045, _SHARE / 12.92, ((_SHARE + 0.055) / 1.055) ** 2.4)
 
 
 class Lit(NamedTuple):
@@ -236,14 +238,14 @@ class _Room:
         way = np.minimum(np.minimum(down, ahead), 1e3)
         points = origin[:, None] + way * rays
         floor_px, wall_px = self._px_per_m
-        footprint = floor_px * way / (400.0 * np.maximum(-rays[2], 0.05))
-        level = np.clip(np.log2(np.maximum(footprint, 1.0)), 0, LEVELS - 1).round().astype(int)
         found = np.empty_like(points)
-        wall = np.flatnonzero(~is_floor)
+        wall, ground = np.flatnonzero(~is_floor), np.flatnonzero(is_floor)
         y, z = (points[1:, wall].T * wall_px + self._shift[2:]).T
         found[:, wall] = _sampled(self._wall, y, z).T
+        footprint = floor_px * way[ground] / (400.0 * np.maximum(-rays[2, ground], 0.05))
+        level = np.clip(np.log2(np.maximum(footprint, 1.0)), 0, LEVELS - 1).round().astype(int)
         for k, floor in enumerate(self._floors):
-            chosen = np.flatnonzero(is_floor & (level == k))
+            chosen = ground[level == k]
             x, y = (points[:2, chosen].T * floor_px + self._shift[:2]).T
             found[:, chosen] = _sampled(floor, x / 2**k, y / 2**k).T
         return found, points, is_floor
@@ -382,8 +384,7 @@ def _through_camera(levels: Floats, kind: LightKind, random: Random) -> Pixels:
 
 def _linear(levels: Pixels) -> NDArray[np.float32]:
     """Linear light, 0 to 1, of levels in sRGB (IEC 61966-2-1)."""
-    share = levels.astype(np.float32) / 255.0
-    return np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
+    return _LINEAR[levels]
 
 
 def _encoded(linear: Floats) -> Floats:

@@ -16,6 +16,7 @@ from support.core import (
     VARIANTS,
     Matrix,
     diagonal,
+    displaced,
     driven,
     fix,
     heading_error,
@@ -229,19 +230,13 @@ class Run(NamedTuple):
         return math.degrees(math.sqrt(np.mean(self.errors[:, 2] ** 2)))
 
 
-def drawn(pose: Pose2, covariance: Covariance3, rng: np.random.Generator) -> Pose2:
-    values, vectors = np.linalg.eigh(matrix3(covariance))
-    x, y, h = vectors @ (np.sqrt(np.maximum(values, 0.0)) * rng.normal(size=3))
-    return Pose2(pose.x + x, pose.y + y, wrap_angle(pose.heading + h))
-
-
 class Observer:
     """A teammate that stands; what it believes of itself is off by what it claims, in all its
     fixes the same."""
 
     def __init__(self, off_m: float, off_deg: float, rng: np.random.Generator) -> None:
         covariance = diagonal(off_m, math.radians(off_deg))
-        self._believed = Estimate(drawn(WATCH, covariance, rng), covariance)
+        self._believed = Estimate(displaced(WATCH, covariance, rng), covariance)
         self._rng = rng
 
     def sees(self, truth: Pose2, stamp_ns: int, headed: bool) -> Fix:
@@ -268,11 +263,11 @@ def blind(robot: Localizer, seed: int, headed: bool, off_m: float, off_deg: floa
     rng = np.random.default_rng(seed)
     state = robot.start(0)
     observer = Observer(off_m, off_deg, rng)
-    truth = drawn(state.estimate.pose, state.estimate.covariance, rng)
+    truth = displaced(state.estimate.pose, state.estimate.covariance, rng)
     errors, covariances = [], []
     for i, (distance, turn) in enumerate(loop()[: len(loop()) // 2]):
         noise = motion_noise(truth.heading, distance, turn, ODOMETRY)
-        truth = drawn(step(truth, distance, turn), noise, rng)
+        truth = displaced(step(truth, distance, turn), noise, rng)
         state, now = _driven_on(robot, state, i, distance, turn)
         if i % 5 == 0:
             state = robot.add_fix(state, observer.sees(truth, now, headed))

@@ -56,7 +56,7 @@ def test_a_recording_ends_where_its_disk_is_full_and_nobody_notices(
 
 
 def test_a_run_on_a_full_disk_goes_on_to_its_report() -> None:
-    ran = cpcbl_team("up", "--duration", 2, "--report", FULL, "--json")
+    ran = cpcbl_team("up", "--robots", "observer", "--duration", 2, "--report", FULL, "--json")
     assert ran.returncode == 1
     assert set(json.loads(ran.stdout)["robots"]) == {"navigator", "observer", "scout", "patrol"}
     assert ran.stderr.splitlines()[-1] == f"cpcbl-team: /dev/full: not written: {NO_SPACE}"
@@ -118,7 +118,7 @@ def test_a_simulation_whose_picture_is_lost_still_reports(tmp_path: Path) -> Non
     pytest.importorskip("matplotlib")
     path = tmp_path / "run.png"
     path.symlink_to(FULL)
-    ran = cpcbl_team("simulate", "--duration", 4, "--picture", path, "--json")
+    ran = command_line("simulate", "--duration", 4, "--picture", path, "--json")
     assert ran.returncode == 1
     assert json.loads(ran.stdout)["not_written"] == {str(path): NO_SPACE}
 
@@ -143,7 +143,7 @@ def test_an_experiment_whose_file_is_a_folder_is_refused_before_it_runs(
 ) -> None:
     pytest.importorskip("matplotlib")
     (tmp_path / f"table1.{ending}").mkdir()
-    ran = cpcbl_team("experiment", "table1", "--output", tmp_path)
+    ran = command_line("experiment", "table1", "--output", tmp_path)
     assert ran.returncode == 2
     (line,) = ran.stderr.splitlines()
     assert f"table1.{ending}: a folder; name a file" in line
@@ -153,7 +153,7 @@ def test_an_evaluation_whose_export_is_lost_still_reports(tmp_path: Path) -> Non
     write_log(tmp_path / "log", seconds=4.0)
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "1_estimate.tum").symlink_to(FULL)
-    ran = cpcbl_team(
+    ran = command_line(
         *("evaluate", "mrclam-uncalibrated", tmp_path / "log"),
         *("--export", tmp_path / "out", "--json"),
     )
@@ -163,7 +163,7 @@ def test_an_evaluation_whose_export_is_lost_still_reports(tmp_path: Path) -> Non
 
 
 def test_a_compose_file_that_is_lost_is_named() -> None:
-    ran = cpcbl_team("compose", "--output", FULL)
+    ran = command_line("compose", "--output", FULL)
     assert ran.returncode == 1
     assert ran.stderr.splitlines() == [f"cpcbl-team: /dev/full: not written: {NO_SPACE}"]
 

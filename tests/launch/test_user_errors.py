@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from support.processes import cpcbl_team, eventually
+from support.processes import command_line, cpcbl_team, eventually
 
 from cpcbl_agents.extras import command_from_origin, install_command
 from cpcbl_agents.stop import StopSignal
@@ -56,14 +56,14 @@ def test_a_run_in_which_nobody_drives_fails_and_says_so(external: Path, tmp_path
 
 
 def test_an_unknown_team_lists_those_that_there_are() -> None:
-    ran = cpcbl_team("up", "nosuch")
+    ran = command_line("up", "nosuch")
     assert ran.returncode == 2
     assert "nosuch: no such file; the built-in teams are blind, circuit," in last_line(ran)
 
 
 def test_a_team_of_logs_asks_for_its_log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    ran = cpcbl_team("up", "mrclam")
+    ran = command_line("up", "mrclam")
     assert ran.returncode == 2
     assert "--data MRCLAM6" in last_line(ran)
 
@@ -175,7 +175,7 @@ def test_ctrl_c_while_a_router_is_waited_for_has_the_same_exit_code(
 def test_a_very_long_line_is_cut_in_its_middle(tmp_path: Path) -> None:
     path = tmp_path / "team.toml"
     path.write_text(f"{'x' * 5000} = 1\n{EXTERNAL.format(name='real')}")
-    ran = cpcbl_team("check", path)
+    ran = command_line("check", path)
     assert ran.returncode == 2
     line = last_line(ran)
     assert str(path) in line

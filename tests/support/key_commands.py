@@ -8,7 +8,7 @@ from typer.testing import CliRunner
 
 from cpcbl_launch.app import build_app
 from cpcbl_launch.team.file import builtin_path
-from support.processes import cpcbl_team
+from support.processes import command_line
 
 SECURED = '\n[transport]\nsecurity = "mtls"\n'
 
@@ -31,7 +31,7 @@ def keys(file: Path, *more: object) -> dict[str, dict[str, Any]]:
 
 def refused(*command: object) -> str:
     """The one line with which a command ends that cannot be done."""
-    done = cpcbl_team(*command)
+    done = command_line(*command)
     assert done.returncode == 2, done.stdout + done.stderr
     assert "Traceback" not in done.stderr
     (line,) = [line for line in done.stderr.splitlines() if line.startswith("cpcbl-team: ")]

@@ -2,14 +2,18 @@
 
 import io
 import logging
+import os
+import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Sequence
-from contextlib import redirect_stderr, redirect_stdout
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
 
 from cpcbl_launch.cli import main
 from cpcbl_launch.run.processes import PROGRAM
+
+STOPS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 def cpcbl_team(*arguments: object, timeout_s: float = 300.0) -> "subprocess.CompletedProcess[str]":
@@ -25,18 +29,36 @@ def cpcbl_team(*arguments: object, timeout_s: float = 300.0) -> "subprocess.Comp
 
 def command_line(*arguments: object) -> "subprocess.CompletedProcess[str]":
     """What `cpcbl-team ARGUMENTS` prints and its exit code, run in this process: for commands that
-    end before they start anything."""
+    start no others. The import of a process of its own costs up to a second of CPU time."""
     words, output, errors = [*map(str, arguments)], io.StringIO(), io.StringIO()
-    handlers, argv, code = logging.root.handlers[:], sys.argv, 0
-    try:
-        sys.argv = ["cpcbl-team", *words]
-        with redirect_stdout(output), redirect_stderr(errors):
-            main()
-    except SystemExit as end:
-        code = end.code if isinstance(end.code, int) else int(end.code is not None)
-    finally:
-        sys.argv, logging.root.handlers[:] = argv, handlers
+    code = 0
+    with _as_in_a_new_process(["cpcbl-team", *words]):
+        try:
+            with redirect_stdout(output), redirect_stderr(errors):
+                main()
+        except SystemExit as end:
+            code = end.code if isinstance(end.code, int) else int(end.code is not None)
     return subprocess.CompletedProcess(words, code, output.getvalue(), errors.getvalue())
+
+
+@contextmanager
+def _as_in_a_new_process(argv: list[str]) -> Iterator[None]:
+    """Words of a command line, and logging that nobody has configured. Afterwards all is as it was,
+    and so are the handlers of signals."""
+    root, words = logging.root, sys.argv
+    handlers, level = root.handlers[:], root.level
+    signals = {number: signal.getsignal(number) for number in STOPS}
+    output = os.dup(1)  # a command that cannot write a file closes it
+    sys.argv, root.handlers[:] = argv, []
+    try:
+        yield
+    finally:
+        sys.argv, root.handlers[:] = words, handlers
+        root.setLevel(level)
+        os.dup2(output, 1)
+        os.close(output)
+        for number, handler in signals.items():
+            signal.signal(number, handler)
 
 
 PATIENT = """

@@ -358,7 +358,7 @@ def test_the_command_line_writes_a_team_that_it_can_check(folder: Path, tmp_path
     assert camera.fx_px == pytest.approx(LENS.fx_px, rel=0.004)
     assert camera.distortion[0] == pytest.approx(LENS.distortion[0], abs=0.01)
     assert camera.mounted_m == 0.31
-    assert cpcbl_team("check", team).returncode == 0
+    assert command_line("check", team).returncode == 0
 
 
 def test_json_and_boards_and_what_is_wrong(folder: Path, tmp_path: Path) -> None:

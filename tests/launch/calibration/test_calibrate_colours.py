@@ -334,7 +334,7 @@ def test_the_command_line_writes_a_team_that_it_can_check(folder: Path, tmp_path
     colours = load_team(team).vision.colours
     assert colours.keys() == PAINT.keys()
     assert "# by the window" in team.read_text()
-    assert cpcbl_team("check", team).returncode == 0
+    assert command_line("check", team).returncode == 0
 
 
 def test_json_and_what_is_wrong_in_one_line(folder: Path, tmp_path: Path) -> None:

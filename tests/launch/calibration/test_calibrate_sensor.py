@@ -374,8 +374,8 @@ def test_the_command_line_writes_a_team_that_it_can_check(wrong: Path, tmp_path:
     assert "# by a ruler" in team.read_text()
     sensor = load_team(team).robots["eye"].sensor
     assert sensor.bearing_bias_deg == pytest.approx(-ASIDE_DEG, abs=0.05)
-    assert cpcbl_team("check", team).returncode == 0
-    shown = cpcbl_team("calibrate", "sensor", *options, "--json")
+    assert command_line("check", team).returncode == 0
+    shown = command_line("calibrate", "sensor", *options, "--json")
     assert json.loads(shown.stdout)["sensor"]["range_scale"]["value"] > 1.0
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import msgspec
 import pytest
 from support.calibration_team import MAP, SECONDS, STANDING, TEAM
-from support.processes import cpcbl_team
+from support.processes import command_line, cpcbl_team
 from support.simulated import simulate_recorded
 
 from cpcbl_launch.calibration.logs import read_log, read_logs
@@ -122,7 +122,7 @@ def test_calibrate_prints_writes_and_draws(tmp_path: Path) -> None:
     assert team.robots["a"].odometry.distance_scale == pytest.approx(0.93, abs=0.03)
     assert team.robots["c"].odometry == STANDING.odometry
     assert team.map == MAP
-    checked = cpcbl_team("check", type_text)
+    checked = command_line("check", type_text)
     assert checked.returncode == 0, checked.stderr
     simulate(team, 1, 1.0)
 
@@ -136,7 +136,7 @@ def test_what_a_short_recording_does_not_tell_is_not_written(tmp_path: Path) -> 
     ]
     assert all(math.isfinite(e.value) and math.isfinite(e.standard_error) for e in estimates)
     assert any("not determined by the logs: " in note for note in found.robots["a"].notes)
-    ran = cpcbl_team("calibrate", path, "--output", output)
+    ran = command_line("calibrate", path, "--output", output)
     assert ran.returncode == 0, ran.stderr
     assert "nan" not in output.read_text()
     assert "nan" not in ran.stdout
@@ -147,7 +147,7 @@ def test_a_time_in_which_errors_fade_is_not_known_of_a_recording_too_short_to_sh
 ) -> None:
     path, output = tmp_path / "short.mcap", tmp_path / "calibrated.toml"
     simulate_recorded(TEAM, 1, 3.0, path)
-    ran = cpcbl_team("calibrate", path, "--output", output)
+    ran = command_line("calibrate", path, "--output", output)
     assert ran.returncode == 0, ran.stderr
     assert "0.0000 ± 0.0000" not in ran.stdout
     assert "correlation_s" in ran.stdout

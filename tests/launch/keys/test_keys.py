@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from support.key_commands import TEAM, keys, refused
 from support.keys import again, secured_team
-from support.processes import cpcbl_team
+from support.processes import command_line
 
 from cpcbl_agents.extras import install_command
 from cpcbl_launch.keys.authority import certificate_facts, issue_certificate, new_authority
@@ -200,7 +200,7 @@ def test_without_the_library_the_extra_is_named(team_file: Path) -> None:
 
 
 def test_a_table_says_what_was_made(team_file: Path) -> None:
-    done = cpcbl_team("keys", team_file, "--observer", "tripod")
+    done = command_line("keys", team_file, "--observer", "tripod")
     for word in ("robot/r1", "observer/tripod", "made", "localhost", "private.key"):
         assert word in done.stdout
     rows = [line for line in done.stdout.splitlines() if " made" in line]

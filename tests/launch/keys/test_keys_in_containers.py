@@ -13,12 +13,12 @@ import pytest
 import yaml
 from support.docker import TOP, image
 from support.key_commands import demo, keys, refused
-from support.processes import cpcbl_team
+from support.processes import command_line, cpcbl_team
 
 
 def services(file: Path) -> dict[str, Any]:
     """What `compose` says of each service of a team."""
-    done = cpcbl_team("compose", file)
+    done = command_line("compose", file)
     assert done.returncode == 0, done.stderr
     said: dict[str, Any] = yaml.safe_load(done.stdout)["services"]
     return said

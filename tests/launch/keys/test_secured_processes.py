@@ -11,7 +11,7 @@ import pytest
 from support.buses import Subscription, wait_until
 from support.key_commands import TEAM, demo, keys, refused
 from support.keys import OPERATOR, R1, session, with_credentials
-from support.processes import cpcbl_team, eventually, patient_up
+from support.processes import command_line, cpcbl_team, eventually, patient_up
 
 from cpcbl_launch.run.processes import PROGRAM
 from cpcbl_launch.run.up import free_endpoint
@@ -136,7 +136,7 @@ def test_an_observer_joins_a_secured_team_with_its_own_certificate(tmp_path: Pat
 def test_a_printed_configuration_is_as_strict(team_file: Path) -> None:
     keys(team_file)
     endpoint = free_endpoint("tls")
-    printed = cpcbl_team("router", team_file, "--listen", endpoint, "--print-config")
+    printed = command_line("router", team_file, "--listen", endpoint, "--print-config")
     assert "PRIVATE KEY" not in printed.stdout
     config = team_file.parent / "router.json5"
     config.write_text(printed.stdout)

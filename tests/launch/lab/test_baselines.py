@@ -19,7 +19,7 @@ from support.noisy_logs import (
     with_robot_settings,
     with_start_poses,
 )
-from support.processes import command_line, cpcbl_team
+from support.processes import command_line
 
 from cpcbl_launch.lab.baselines import baseline_inputs
 from cpcbl_launch.lab.evaluation import (
@@ -192,7 +192,7 @@ def test_evaluate_compares_and_exports(tmp_path: Path) -> None:
     write_log(data, ROBOTS, 10.0)
     add_noise(data, 8)
     options = ("--yardstick", "--export", files, "--blind", "3", "--json")
-    ran = cpcbl_team("evaluate", "mrclam-uncalibrated", data, *options)
+    ran = command_line("evaluate", "mrclam-uncalibrated", data, *options)
     assert ran.returncode == 0, ran.stderr
     report = json.loads(ran.stdout)
     assert tuple(report["yardsticks"]) == KINDS
@@ -215,7 +215,7 @@ def test_evaluate_compares_and_exports(tmp_path: Path) -> None:
 def test_the_table_of_baselines_fits_and_is_shown_on_demand(tmp_path: Path) -> None:
     write_log(tmp_path, ROBOTS, 3.0)
     plain, compared_ = (
-        cpcbl_team("evaluate", "mrclam-uncalibrated", tmp_path, *options)
+        command_line("evaluate", "mrclam-uncalibrated", tmp_path, *options)
         for options in ((), ("--yardstick",))
     )
     for words in ("dead reckoning", "solo EKF", "centralized EKF", "this team"):

@@ -10,7 +10,7 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import pytest
-from support.processes import cpcbl_team, eventually, pids_of
+from support.processes import command_line, eventually, pids_of
 from support.programs import Program, programs
 
 from cpcbl_launch.recordings.read import Run, read_run
@@ -132,7 +132,7 @@ def test_cameras_guests_budgets_keys_and_two_sites(tmp_path: Path) -> None:
     team = tmp_path / "team.toml"
     eyes = builtin_path("eyes").read_text(encoding="utf-8")
     team.write_text(TEAM.format(eyes=eyes, near=near), encoding="utf-8")
-    keys = cpcbl_team("keys", team, "--observer", "tripod")
+    keys = command_line("keys", team, "--observer", "tripod")
     assert keys.returncode == 0, keys.stderr
     with two_sites(tmp_path, team, near, far, folder):
         began_s = time.monotonic()

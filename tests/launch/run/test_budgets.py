@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 from support.logs import write_log
-from support.processes import cpcbl_team
+from support.processes import command_line
 from support.traffic import TEAM, status
 
 from cpcbl_launch.cli import main
@@ -63,7 +63,7 @@ def test_a_simulated_team_keeps_to_a_tiny_budget(tmp_path: Path) -> None:
     path = tmp_path / "trio.toml"
     path.write_text(TEAM)
     options = ["--bytes-per-s", 20, "--match-messages", 6000, "--duration", 25]
-    ran = cpcbl_team("simulate", path, *options, "--json")
+    ran = command_line("simulate", path, *options, "--json")
     assert ran.returncode == 0, ran.stderr
     report = json.loads(ran.stdout)
     assert report["team"]["within_budget"] is True
@@ -81,7 +81,7 @@ def test_a_simulated_team_keeps_to_a_tiny_budget(tmp_path: Path) -> None:
 def test_a_log_is_evaluated_with_a_budget(tmp_path: Path) -> None:
     write_log(tmp_path, ("1", "2"), seconds=20.0)
     options = ["--blind", "2", "--messages-per-minute", 375.5]
-    ran = cpcbl_team("evaluate", "mrclam-uncalibrated", tmp_path, *options, "--json")
+    ran = command_line("evaluate", "mrclam-uncalibrated", tmp_path, *options, "--json")
     assert ran.returncode == 0, ran.stderr
     report = json.loads(ran.stdout)
     (limit,) = report["robots"]["1"]["spending"]

@@ -11,7 +11,7 @@ import yaml
 from msgspec.structs import replace
 from support.buses import robot_at, team_of
 from support.docker import TOP
-from support.processes import cpcbl_team
+from support.processes import command_line
 
 from cpcbl_launch.run.containers.compose import Deployment, Mount, compose_text, deployment_text
 from cpcbl_launch.run.containers.docker import (
@@ -138,7 +138,7 @@ def test_a_file_of_ones_own_is_mounted_by_its_way_from_the_compose_file(tmp_path
     (tmp_path / "teams").mkdir()
     team_file, output = tmp_path / "teams" / "lab.toml", tmp_path / "compose.yaml"
     shutil.copy(builtin_path("demo"), team_file)
-    ended = cpcbl_team("compose", team_file, "--image", "mine:2", "--output", output)
+    ended = command_line("compose", team_file, "--image", "mine:2", "--output", output)
     assert ended.returncode == 0, ended.stderr
     found = yaml.safe_load(output.read_text())["services"]
     assert "build" not in found["router"]

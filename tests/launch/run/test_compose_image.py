@@ -1,12 +1,10 @@
 """Who builds the image of a compose file is said with it, always."""
 
-import subprocess
-
 import pytest
 from support.docker import TOP
+from support.processes import command_line
 
 from cpcbl_launch.run.containers.docker import version
-from cpcbl_launch.run.processes import PROGRAM
 
 
 @pytest.mark.parametrize(
@@ -17,8 +15,11 @@ from cpcbl_launch.run.processes import PROGRAM
         (["--image", "mine:2"], "The image mine:2 must exist; in a checkout: docker build --file"),
     ],
 )
-def test_the_origin_of_the_image_is_said(options: list[str], said: str) -> None:
-    command = [*PROGRAM, "compose", "demo", *options]
-    printed = subprocess.run(command, cwd=TOP, capture_output=True, text=True, check=True)
+def test_the_origin_of_the_image_is_said(
+    options: list[str], said: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(TOP)
+    printed = command_line("compose", "demo", *options)
+    assert printed.returncode == 0
     assert said in printed.stdout
     assert said in printed.stderr

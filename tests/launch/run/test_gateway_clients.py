@@ -155,7 +155,7 @@ def test_a_port_in_use_is_named(tmp_path: Path) -> None:
     port = int(endpoint.rpartition(":")[2])
     team.write_text(TEAM.format(port=port) + f'[transport]\nconnect = ["{endpoint}"]\n')
     with open_router("doors", [endpoint]):
-        ended = cpcbl_team("gateway", team)
+        ended = command_line("gateway", team)
     assert ended.returncode == 2
     assert f"gateway.port: 127.0.0.1:{port}: " in ended.stderr
     assert "choose another" in ended.stderr.splitlines()[-1]

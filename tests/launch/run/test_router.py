@@ -173,7 +173,7 @@ def test_a_router_that_reads_the_printed_configuration_is_the_same_one(
 
 
 def test_the_printed_configuration_is_whole(team_file: Path) -> None:
-    printed = cpcbl_team(
+    printed = command_line(
         *("router", team_file, "--print-config"),
         *("--listen", "tcp/0.0.0.0:7447", "--connect", "tcp/10.0.0.2:7447"),
     )
@@ -270,13 +270,13 @@ def test_what_the_user_can_mend_is_one_line(arguments: list[str], said: str) -> 
 def test_a_port_that_is_taken_is_said_in_one_line(team_file: Path) -> None:
     endpoint = free_endpoint()
     with running(team_file, "--listen", endpoint):
-        ended = cpcbl_team("router", team_file, "--listen", endpoint)
+        ended = command_line("router", team_file, "--listen", endpoint)
     assert ended.returncode == 2
     (line,) = ended.stderr.splitlines()
     assert f"cannot listen on {endpoint}" in line
 
 
 def test_without_an_endpoint_it_listens_where_the_robots_of_this_machine_look() -> None:
-    printed = cpcbl_team("router", "demo", "--print-config").stdout
+    printed = command_line("router", "demo", "--print-config").stdout
     team = load_team(builtin_path("demo"))
     assert all(f'"{endpoint}"' in printed for endpoint in team.transport.connect)

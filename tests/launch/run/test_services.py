@@ -11,7 +11,7 @@ from importlib.resources import files
 from pathlib import Path
 
 import pytest
-from support.processes import eventually
+from support.processes import command_line, eventually
 
 from cpcbl_agents.watchdog import notify, with_watchdog
 from cpcbl_launch.run.processes import PROGRAM
@@ -73,10 +73,8 @@ def test_a_unit_runs_a_command_that_there_is(unit: str) -> None:
     text = (files("cpcbl_launch") / "systemd" / unit).read_text()
     line = next(line for line in text.splitlines() if line.startswith("ExecStart="))
     words = line.removeprefix(f"ExecStart={COMMAND} ").replace("%i", "r1").split()
-    command = (*PROGRAM, *words[:1], "--help")
-    said = subprocess.run(command, capture_output=True, text=True, check=True).stdout
     assert words[0] in ("robot", "router")
-    assert "Usage: " in said
+    assert "Usage: " in command_line(*words[:1], "--help").stdout
 
 
 def test_robot_and_router_tell_that_they_are_ready_and_alive_until_they_hang(

@@ -81,7 +81,7 @@ def test_eyes_are_shown_pictures(team_file: Path, pictures: Path) -> None:
     assert drawn is not None
     assert plain is not None
     assert np.abs(drawn.astype(int) - plain).max() > 100  # an outline and a label
-    said = cpcbl_team(*words, "--count", 2).stdout
+    said = command_line(*words, "--count", 2).stdout
     for word in (
         "broken.png",
         "the end of the picture is missing (frame_truncated)",
@@ -122,7 +122,7 @@ def test_a_running_robot_shows_what_it_sees_and_a_recording_holds_it(team_file: 
             look = ("look", team_file, "looker", "--output", folder / "looks")
             ran = cpcbl_team(*look, "--count", 3, "--wait", 30, "--json")
             assert ran.returncode == 0, ran.stderr
-            again = cpcbl_team(*look, "--wait", 30)
+            again = command_line(*look, "--wait", 30)
             assert len(re.findall(r"^seen +1\.5\d ", again.stdout, re.MULTILINE)) == 1
         finally:
             team.send_signal(signal.SIGINT)

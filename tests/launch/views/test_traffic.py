@@ -13,7 +13,7 @@ import msgspec
 import pytest
 from rich.console import Console, RenderableType
 from support.buses import SECOND, TeamOnBus, robot_at, saw, team_of, wait_until
-from support.processes import cpcbl_team, pids_of
+from support.processes import command_line, cpcbl_team, pids_of
 from support.routers import open_router
 from support.traffic import MISER_BYTES_PER_S, TEAM, flow, recorded, seen, shown, status
 
@@ -298,7 +298,7 @@ def test_watching_ends_with_a_signal(number: signal.Signals) -> None:
 
 def test_without_a_router_watching_ends_with_one_line() -> None:
     endpoint = free_endpoint()
-    ended = cpcbl_team("traffic", "demo", "--connect", endpoint, "--wait", 0.5)
+    ended = command_line("traffic", "demo", "--connect", endpoint, "--wait", 0.5)
     assert ended.returncode == 2
     (line,) = ended.stderr.splitlines()
     assert f"no router at {endpoint} within 0.5 s" in line
