@@ -24,6 +24,7 @@ POSITION_SENSOR = "position sensor"
 EARLIER_NS = 1_000_000_000  # since an earlier fix, in which a teammate does not get far
 MOST_SHIFT = 0.25  # of a range; a Gaussian does not describe what is less certain
 MEAN_S = 0.3  # over which the place of a teammate is a mean
+MOST_OFF = 4.0  # sigmas of a bearing from the direction of that place
 _NOTHING = Covariance2(0.0, 0.0, 0.0)
 _AXES = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
 _HEADING = ((0.0, 0.0, 1.0),)
@@ -75,9 +76,9 @@ def fix_for(
     if range_m > sensor.max_range_for_range_m:  # only its bearing is good enough
         return None
     pose, covariance = estimate.pose, estimate.covariance
-    if earlier is not None and stamp_ns - earlier.stamp_ns > EARLIER_NS:
-        earlier = None
-    sighted, toward = _sighted_gaussian(sighting, range_m, bearing, sensor, pose, earlier)
+    is_late = earlier is not None and stamp_ns - earlier.stamp_ns > EARLIER_NS
+    place = None if earlier is None or is_late else pose.inverse().transform(earlier.x, earlier.y)
+    sighted, toward = _sighted_gaussian(sighting, range_m, bearing, sensor, place)
     x, y = pose.transform(sighted.x, sighted.y)
     rotated = sighted.covariance.rotated(pose.heading)
     distance = math.hypot(sighted.x, sighted.y)
@@ -112,23 +113,24 @@ def _sighted_gaussian(
     range_m: float,
     bearing: float,
     sensor: SensorSettings,
-    pose: Pose2,
-    earlier: MeanPlace | None,
+    earlier: tuple[float, float] | None,
 ) -> tuple[Gaussian2, float]:
-    """The teammate in the observer's frame, and the bearing (rad) at which its covariance is."""
-    if earlier is None:
-        range_sigma, bearing_sigma = sighting_sigmas(sighting, sensor)
-        share = sensor.range_share if sighting.range_sigma_m is None else 0.0
+    """The teammate in the observer's frame, and the bearing (rad) at which its covariance is.
+    `earlier`: where it was seen of late, in that frame (m)."""
+    x, y = earlier or (0.0, 0.0)
+    expected_m = math.hypot(x, y) if earlier else None
+    range_sigma, bearing_sigma = sighting_sigmas(sighting, sensor, expected_m)
+    off = wrap_angle(bearing - math.atan2(y, x))
+    if earlier is None or abs(off) > MOST_OFF * bearing_sigma:  # it moves faster than errors do
+        of_reading = earlier is None and sighting.range_sigma_m is None
+        share = sensor.range_share if of_reading else 0.0
         mean_m = unbiased_range_m(range_m, range_sigma, bearing_sigma, share)
-        along_m = math.hypot(range_sigma, range_m * arc_width(bearing_sigma))
-        toward = bearing
+        turned, toward = arc_width(bearing_sigma), bearing
     else:
-        x, y = pose.inverse().transform(earlier.x, earlier.y)
-        range_sigma, bearing_sigma = sighting_sigmas(sighting, sensor, math.hypot(x, y))
         mean_m = range_m * min(math.exp(0.5 * bearing_sigma**2), 1.0 + MOST_SHIFT)
-        # Of the error across, a share as large as the error of the direction is along it
-        along_m = math.hypot(range_sigma, range_m * bearing_sigma**2)
-        toward = math.atan2(y, x)
+        # Of an error across, the share by which the direction is wrong is along it
+        turned, toward = bearing_sigma * max(bearing_sigma, abs(off)), bearing - off
+    along_m = math.hypot(range_sigma, range_m * turned)
     _, _, covariance = sighting_gaussian(range_m, toward, along_m, bearing_sigma)
     return Gaussian2(mean_m * math.cos(bearing), mean_m * math.sin(bearing), covariance), toward
 

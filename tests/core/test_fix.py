@@ -164,6 +164,31 @@ def test_no_fixes_are_chosen_by_their_own_errors(rate_hz: float) -> None:
     assert np.mean(squares) < 3.5
 
 
+@pytest.mark.parametrize("range_m", [1.0, 3.0])
+@pytest.mark.parametrize("speed_m_s", [0.0, 0.5, 1.5, 3.0])
+@pytest.mark.parametrize(("sigma_deg", "sigma_m", "rate_hz"), [(3.0, 0.01, 10.0), (8.0, 0.05, 3.0)])
+def test_a_teammate_that_drives_across_is_where_its_fixes_say(
+    sigma_deg: float, sigma_m: float, rate_hz: float, speed_m_s: float, range_m: float
+) -> None:
+    """The place where it was of late is not in the direction in which it is now."""
+    sensor = replace(SENSOR, range_share=0.0, range_floor_m=sigma_m, bearing_sigma_deg=sigma_deg)
+    here, squares = Estimate(Pose2(0.0, 0.0, 0.0), diagonal(1e-4, 1e-4)), []
+    for seed in range(8):
+        rng, place = np.random.default_rng(seed), None
+        for i in range(60):
+            y = speed_m_s * (i - 30) / rate_hz
+            read = math.hypot(range_m, y) + sigma_m * rng.normal(), math.atan2(y, range_m)
+            seen = Sighting("me", read[0], read[1] + math.radians(sigma_deg) * rng.normal())
+            fix = fix_for("mate", int((i + 1) / rate_hz * SECOND), here, seen, sensor, place)
+            assert fix is not None
+            place = mean_place(place, fix)
+            off = np.array([fix.x_m - range_m, fix.y_m - y])
+            noise = matrix2(Covariance2(*fix.sensor_covariance))
+            squares.append(off @ np.linalg.solve(noise, off))
+    assert np.mean(squares) < 2.3
+    assert np.mean(np.array(squares) > 11.8) < 0.03
+
+
 def test_a_position_is_not_paid_for_with_the_heading() -> None:
     """Each report of a teammate that may have errors in common with a robot inflates what is known
     already. A heading of 30° would be one of 60° after some seconds, and the robot lost."""
