@@ -5,14 +5,27 @@ import math
 import numpy as np
 import pytest
 from core.test_calibration_filter import MARKS, NOISE, Sensor, Truth, drives, started
-from support.core import diagonal
+from support.core import (
+    LOOP_START,
+    SECOND,
+    Noise,
+    diagonal,
+    followed,
+    localizer,
+    loop,
+    matrix2,
+    sensor_noise,
+    state_at,
+)
 
 from cpcbl_team.calibration_doubt import ODDS, with_doubt, with_probabilities
 from cpcbl_team.calibration_filter import FILTERS, FIRST_SIGMAS, CalibrationFilter
+from cpcbl_team.config import SensorSettings
 from cpcbl_team.estimate import Covariance3, Estimate
 from cpcbl_team.geometry import Pose2
+from cpcbl_team.inputs import Sighting
 from cpcbl_team.miscalibration import AS_CONFIGURED, Adaptation
-from cpcbl_team.range_errors import RangeErrors
+from cpcbl_team.range_errors import NO_RANGE_ERRORS, RangeErrors
 
 TWO = Sensor(names="ac")  # of which each second filter but one sees both
 HERE = Pose2(0.0, 0.0, 0.0)
@@ -124,3 +137,31 @@ def test_wrong_settings_are_doubted_with_two_landmarks(truth: Truth) -> None:
     for seed in range(3):
         found = filters_over_time(truth, seed, TWO, 300)
         assert probability(found[-1]) > 0.9
+
+
+@pytest.mark.parametrize("scale", [0.9, 1.1])
+def test_a_robot_with_wrong_ranges_reports_that_it_is_uncertain(scale: float) -> None:
+    """With two landmarks it never corrects them, and its own covariance knows nothing of it."""
+    sensor = SensorSettings(range_share=0.05, bearing_sigma_deg=2.0)
+    robot, reported, alone = localizer(sensor=sensor), list[float](), list[float]()
+    for seed in range(2):
+        noisy = sensor_noise(np.random.default_rng(seed), sensor)
+
+        def wrong(exact: Sighting, noisy: Noise = noisy) -> Sighting:
+            seen = noisy(exact)
+            assert seen.range_m is not None
+            return Sighting(seen.id, scale * seen.range_m, seen.bearing_rad)
+
+        state = state_at(LOOP_START, diagonal(0.05, 0.05))
+        for now, truth in followed(
+            robot, state, LOOP_START, 3 * loop(), names=lambda i: ("ne", "sw"), noise=wrong
+        ):
+            state = now
+            if state.stamp_ns > 30 * SECOND and not state.lost:
+                off = np.array(state.estimate.pose[:2]) - np.array(truth[:2])
+                for estimate, squares in ((state.reported, reported), (state.estimate, alone)):
+                    position = matrix2(estimate.covariance.position())
+                    squares.append(off @ np.linalg.solve(position, off))
+    assert state.memory.calibration.adaptation.ranges == NO_RANGE_ERRORS
+    assert np.mean(reported) < 4.0
+    assert np.mean(alone) > 10.0
