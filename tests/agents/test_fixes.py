@@ -85,7 +85,7 @@ def test_a_newer_fix_takes_the_place_of_one_that_waits() -> None:
     alone.tell(Presence("mate", POOR))
     (fix,) = alone.sees(ahead(range_m=4.0), after_ns=SECOND // 10)
     alone.later(1.0)
-    assert fix.x_m == pytest.approx(4.0, abs=0.001)
+    assert fix.x_m == pytest.approx(4.0, abs=0.005)
     assert alone.early == []
 
 
@@ -95,9 +95,9 @@ def test_the_sigma_of_a_range_does_not_follow_its_own_error() -> None:
     alone.tell(Presence("mate", POORER))
     alone.sees(ahead(range_m=4.0))
     short, long = (alone.sees(ahead(range_m=r))[0].sensor_covariance[0] for r in (3.5, 4.5))
-    assert long == pytest.approx((3.5 / 4.0) ** 2 * short, rel=0.01)
+    assert long == pytest.approx(short, rel=0.01)
     late = alone.sees(ahead(range_m=4.5), after_ns=2 * SECOND)[0].sensor_covariance[0]
-    assert late == pytest.approx((4.5 / 3.5) ** 2 * long, rel=0.01)
+    assert late == pytest.approx((4.5 / 4.0) ** 2 * long, rel=0.01)
 
 
 def test_the_fix_with_the_largest_gain_comes_first() -> None:
