@@ -14,7 +14,7 @@ from cpcbl_team.estimate import (
     offset_pose,
     sharpest,
 )
-from cpcbl_team.fusion import Observation, best_weight
+from cpcbl_team.fusion import MOST_HEADING_VARIANCE, Observation, best_weight
 from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.parameters import Numbers, Parameters, Sensitivity, sensitivity_dot
 
@@ -168,7 +168,8 @@ def updated_by_teammate(
     )
     weight, extent = best_weight(lambda w: size(attempt(w).covariance))
     update = attempt(weight)
-    if extent >= size(prior.covariance) or not update.is_sound:
+    is_too_wide = update.covariance.hh > MOST_HEADING_VARIANCE
+    if extent >= size(prior.covariance) or is_too_wide or not update.is_sound:
         return prior, common
     estimate, common = update.result(prior)
     return estimate._replace(shared=estimate.covariance), common
