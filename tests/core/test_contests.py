@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 from support.core import CORNERS, SECOND, fix, localizer, matrix3
-from support.observed_drive import Drive, Observed, correct
+from support.observed_drive import Drive, Observed, correct, faulty
 from support.trust import AGREES, RULES
 
 from cpcbl_team.config import Field, Start, Unsurveyed
@@ -194,6 +194,18 @@ def test_without_a_majority_sigma_holds_though_a_correct_observer_is_silent_for_
         assert drive.inside_3_sigma > 0.95
         assert math.degrees(drive.state.estimate.heading_sigma_rad) < 60.0
         assert "lost" not in drive.state.counts
+
+
+def test_where_half_are_suddenly_wrong_the_contest_lasts_and_sigma_holds() -> None:
+    """Reports in a dispute have no part in a mean, so by their means both halves agreed still, and
+    the next report ended the contest: a NEES of 6.5, once with both correct ones in quarantine."""
+    observers: dict[str, Observed] = dict.fromkeys("ab", correct)
+    observers |= {name: faulty("bias", until_s=100.0) for name in "cd"}
+    drive = Drive(observers, seed=2)
+    assert drive.state.counts["contested"] == 1
+    assert not {"a", "b"} & drive.quarantines.keys()
+    assert drive.inside_3_sigma > 0.99
+    assert np.mean(drive.nees) < 2.0
 
 
 @pytest.mark.parametrize("field", [CORNERS, Field(unsurveyed={"mast": Unsurveyed()})])
