@@ -9,7 +9,7 @@ the noise is independent and merged as usual.
 import math
 from collections.abc import Callable
 from statistics import NormalDist
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 from cpcbl_team.estimate import (
     HEADING,
@@ -126,7 +126,6 @@ def merge_naive(prior: Estimate, observation: Observation, scope: Scope = POSE) 
 
 _GOLDEN = 0.6180339887498949
 WIDE_RAD = math.radians(10.0)  # sigma of a heading
-MOST_HEADING_VARIANCE: Final = math.tau**2  # rad^2: an error of the heading is at most half a turn
 
 
 def merge_split(prior: Estimate, observation: Observation, scope: Scope = POSE) -> Estimate:
@@ -145,26 +144,12 @@ def merge_split(prior: Estimate, observation: Observation, scope: Scope = POSE) 
     if extent >= _size(prior.covariance, scope):
         return prior
     merged = _merge_with_weight(prior, observation, scope, weight)
-    if merged.covariance.hh > MOST_HEADING_VARIANCE:
-        merged = _with_any_heading(merged)
     is_wider = scope is POSE and merged.covariance.hh > prior.covariance.hh > WIDE_RAD**2
     if not is_wider or any(a for _, _, a in observation.rows):
         return merged
     # A position would be paid for with the heading, until the robot has none
     apart = merge_split(with_all_shared(prior), observation, POSITION)
     return apart if apart.covariance.determinant() < extent else merged
-
-
-def _with_any_heading(estimate: Estimate) -> Estimate:
-    """The estimate with a heading no more uncertain than any can be. Each merge that makes the
-    position certain inflates the heading by a factor: between teammates that contradict each other
-    it grew exponentially, beyond all numbers. S P S with a diagonal S stays a covariance."""
-    share = math.sqrt(MOST_HEADING_VARIANCE / estimate.covariance.hh)
-    covariance, shared = (
-        c._replace(xh=share * c.xh, yh=share * c.yh, hh=share * share * c.hh)
-        for c in (estimate.covariance, estimate.shared)
-    )
-    return estimate._replace(covariance=covariance, shared=shared)
 
 
 def best_weight(objective: Callable[[float], float]) -> tuple[float, float]:

@@ -214,7 +214,7 @@ def test_precise_reports_in_a_contest_make_no_heading_uncertain_beyond_all_numbe
 ) -> None:
     """Each makes a position certain that the contest makes uncertain again, and covariance
     intersection pays with the heading: after 47 s its variance was no number, and the robot's
-    process ended."""
+    process ended. (Where landmarks have no place on the map, errors are states beside the pose.)"""
     robot = localizer(field=field, start=Start(x_m=0.0, y_m=0.0))
     state = robot.mark_shared(robot.start(0), BeliefShared(0))
     for i in range(1000):
