@@ -107,7 +107,7 @@ def attacks() -> tuple[Attack, ...]:
         replace(drift, name="five guests", liars=GUESTS),
         replace(sudden, name="five guests at once", liars=GUESTS),
         replace(renamed, name="guests with new names", liars=GUESTS),
-        replace(sudden, name="guests, one robot", liars=GUESTS, honest=("north",)),
+        replace(sudden, name="guests, one robot", liars=GUESTS, honest=("north",), most_ratio=None),
     ]
     return tuple(replace(case, lie=case.lie.format(victim=case.victim)) for case in cases)
 
