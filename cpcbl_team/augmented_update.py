@@ -1,7 +1,8 @@
 """Updates of a pose together with the errors that the readings have in common."""
 
+import math
 from collections.abc import Callable, Iterable
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 from cpcbl_team.common_errors import CAMERA, CommonErrors
 from cpcbl_team.estimate import (
@@ -17,6 +18,10 @@ from cpcbl_team.estimate import (
 from cpcbl_team.fusion import Observation, best_weight
 from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.parameters import Numbers, Parameters, Sensitivity, sensitivity_dot
+
+MOST_HEADING_VARIANCE: Final = math.tau**2
+"""rad^2: an error of the heading is at most half a turn. Between teammates that contradict each
+other covariance intersection would inflate it with each report, beyond all numbers."""
 
 
 class Reading(NamedTuple):
@@ -168,7 +173,8 @@ def updated_by_teammate(
     )
     weight, extent = best_weight(lambda w: size(attempt(w).covariance))
     update = attempt(weight)
-    if extent >= size(prior.covariance) or not update.is_sound:
+    is_too_wide = update.covariance.hh > MOST_HEADING_VARIANCE
+    if extent >= size(prior.covariance) or is_too_wide or not update.is_sound:
         return prior, common
     estimate, common = update.result(prior)
     return estimate._replace(shared=estimate.covariance), common

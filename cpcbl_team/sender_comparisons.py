@@ -43,13 +43,17 @@ def recent_senders(
             yield name, r
 
 
+def members(senders: SenderRecords, names: Collection[str]) -> list[str]:
+    """Those of them that are no guests."""
+    return [name for name in names if not senders[name].is_guest]
+
+
 def votes(senders: SenderRecords, side: Collection[str], sides: Collection[str]) -> int:
     """The votes of one side of a dispute between all `sides`. Anybody may come as several guests:
     beside two robots of the team they have no vote, and beside one they have one together."""
-    members = sum(not senders[name].is_guest for name in sides)
-    guests = sum(senders[name].is_guest for name in side)
-    most = guests if members == 0 else 2 - members
-    return len(side) - guests + max(0, min(guests, most))
+    of_team = len(members(senders, side))
+    guests, others = len(side) - of_team, len(members(senders, sides))
+    return of_team + max(0, min(guests, 2 - others if others else guests))
 
 
 def voters(senders: SenderRecords, now_ns: int) -> list[str]:
@@ -57,8 +61,7 @@ def voters(senders: SenderRecords, now_ns: int) -> list[str]:
     the first by name: any rule does, as long as it is one of them."""
     recent = sorted(name for name, _ in recent_senders(senders, now_ns) if name != OWN_SENSORS)
     guests = [name for name in recent if senders[name].is_guest]
-    members = [name for name in recent if not senders[name].is_guest]
-    return members + guests[: votes(senders, guests, recent)]
+    return members(senders, recent) + guests[: votes(senders, guests, recent)]
 
 
 def voting_means(senders: SenderRecords, now_ns: int, name: str, of: int) -> dict[str, MeanOffset]:
@@ -82,11 +85,11 @@ def _with_votes(
     """The means without those of guests that have no vote on `name`. The one vote of several guests
     is that of the one that agrees most with the robot of the team that they speak of."""
     guests = [other for other in means if senders[other].is_guest]
-    members = len({*means, name} - {OWN_SENSORS, *guests}) - senders[name].is_guest
-    if not guests or not members:
+    of_team = members(senders, {*means, name} - {OWN_SENSORS})
+    if not guests or not of_team:
         return means
     mean, voting = senders[name].means[of], set[str]()
-    if members == 1 and not senders[name].is_guest and mean is not None:
+    if len(of_team) == 1 and not senders[name].is_guest and mean is not None:
         voting.add(min(guests, key=lambda other: disagreement(mean, means[other])))
     return {n: m for n, m in means.items() if n in voting or not senders[n].is_guest}
 
@@ -122,6 +125,12 @@ def open_rivals(senders: SenderRecords, name: str) -> tuple[Rival, ...]:
         and other.reason is None
         and any(name == back.name for back in other.rivals)
     )
+
+
+def rival_of(record: SenderRecord, name: str, other: SenderRecord) -> Rival:
+    """The other sender beside this one, by what both said last against the estimate."""
+    (x, y), (ox, oy) = (r.mean_offset if r.score else (0.0, 0.0) for r in (record, other))
+    return Rival(name, ox - x, oy - y)
 
 
 def contest_m(senders: SenderRecords, name: str) -> float:

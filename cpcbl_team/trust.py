@@ -16,6 +16,7 @@ readmitted after its reports were right for some time (docs/trust.md).
 """
 
 import math
+from collections.abc import Collection
 from itertools import combinations
 from typing import Final, NamedTuple
 
@@ -29,8 +30,10 @@ from cpcbl_team.sender_comparisons import (
     SenderRecords,
     compare,
     contest_m,
+    members,
     open_rivals,
     recent_senders,
+    rival_of,
     votes,
     voting_means,
     with_comparison,
@@ -44,7 +47,6 @@ from cpcbl_team.sender_records import (
     OffsetEvidence,
     QuarantineReason,
     ReportedPosition,
-    Rival,
     SenderRecord,
     TeammateReport,
     distances_between,
@@ -160,10 +162,8 @@ def _quarantine_by_mean(senders: SenderRecords, name: str, now_ns: int) -> Trust
     right_turn = wrong_turn(senders, name, now_ns)
     if right_turn is not None:
         changed = {**senders, name: quarantined(senders[name], QuarantineReason.HEADING, now_ns)}
-        names = frozenset((name,))
-        return TrustDecision(
-            changed, False, "quarantined", names, estimate_error_rad=abs(right_turn.rad)
-        )
+        decision = TrustDecision(changed, False, "quarantined", frozenset((name,)))
+        return decision._replace(estimate_error_rad=abs(right_turn.rad))
     mean, means = senders[name].means[FAST], voting_means(senders, now_ns, name, FAST)
     if mean is None or not means:
         return TrustDecision(senders, False)
@@ -195,9 +195,11 @@ def _decide_dispute(
     }
     if not supporters:
         return TrustDecision(senders, True)
-    contest = {r.name for n in dissenters for r in open_rivals(senders, n)}
-    if OWN_SENSORS not in dissenters | supporters and contest & supporters:
-        return TrustDecision(senders, True)
+    if OWN_SENSORS not in dissenters | supporters:
+        if any(r.name in supporters for n in dissenters for r in open_rivals(senders, n)):
+            return TrustDecision(senders, True)
+        if not members(recent, supporters) and len(members(recent, dissenters)) == 1:
+            return _without_decision(TrustDecision(senders, True), dissenters, now_ns)
     is_right = _is_estimate_right(recent, dissenters, supporters, began_ns, now_ns)
     if is_right is None:
         return TrustDecision(senders, False)
@@ -213,12 +215,14 @@ def _is_estimate_right(
 ) -> bool | None:
     """Whether the estimate and its supporters are right; None while that is undecided. The robot's
     own sensors decide, otherwise odometry, otherwise the majority, and after some time the estimate
-    before the dispute."""
+    before the dispute. One distance that odometry contradicts, perhaps by chance, takes no vote
+    from the last robot of the team beside guests."""
     if OWN_SENSORS in supporters or OWN_SENSORS in dissenters:
         return OWN_SENSORS in supporters
     all_sides = dissenters | supporters
     conflicting = {n for n in all_sides if is_in_conflict(recent[n], began_ns)}
-    if not all_sides <= conflicting:
+    rest = all_sides - conflicting
+    if rest and (members(recent, rest) or not members(recent, all_sides)):
         dissenters, supporters = dissenters - conflicting, supporters - conflicting
     for_it, against = (votes(recent, side, all_sides) for side in (supporters, dissenters))
     if for_it != against:
@@ -241,15 +245,14 @@ def _quarantine(senders: SenderRecords, name: str, now_ns: int, used_ns: int) ->
     """The decision against one sender."""
     record = senders[name]
     was_followed = bool(record.score) and used_ns >= record.dispute_since_ns
-    errors_m = [math.hypot(*record.mean_offset)] if was_followed else []
+    errors_m = [math.hypot(*record.mean_offset) if was_followed else 0.0]
     changed = {**senders, name: quarantined(record, reason_of(record), now_ns)}
     if record.odometry_conflicts > MOST_CONFLICTS:  # the senders that it contradicted may be right
         for other, accused in senders.items():
             if accused.reason in _BY_COMPARISON and accused.since_ns > now_ns - SILENCE_NS:
                 changed[other] = released(accused, now_ns)
                 errors_m.append(math.hypot(*accused.mean_offset))
-    error_m = max(errors_m, default=0.0)
-    return TrustDecision(changed, False, "quarantined", frozenset((name,)), error_m)
+    return TrustDecision(changed, False, "quarantined", frozenset((name,)), max(errors_m))
 
 
 def _quarantine_supporters(
@@ -267,7 +270,7 @@ def _outvoted_majority(decision: TrustDecision, now_ns: int) -> frozenset[str]:
     """The senders that were quarantined lately, and that agree with those that are now, if they are
     half or more of three or more senders while the robot's own sensors say nothing; else none."""
     recent = {n: r for n, r in decision.senders.items() if now_ns - r.last_report_ns <= RECENT_NS}
-    if OWN_SENSORS in recent or len(recent) < 3:
+    if OWN_SENSORS in recent or votes(recent, recent, recent) < 3:
         return frozenset()
     new = [recent[n].mean_offset for n in decision.quarantined if n in recent]
     out = frozenset(
@@ -281,26 +284,25 @@ def _outvoted_majority(decision: TrustDecision, now_ns: int) -> frozenset[str]:
     return out if is_half else frozenset()
 
 
-def _without_decision(decision: TrustDecision, out: frozenset[str], now_ns: int) -> TrustDecision:
-    """The decision that nobody can decide: these senders are released, and the estimate is as
-    uncertain as they differ from it."""
+def _without_decision(decision: TrustDecision, side: Collection[str], now_ns: int) -> TrustDecision:
+    """The decision that nobody can decide between this side and all others: who is in quarantine
+    on it is released, and the estimate is as uncertain as they differ from it. Means of reports
+    that were not used begin anew, for by the old ones both sides seem to agree."""
     before, errors_m = decision.senders, [decision.estimate_error_m]
+    recent = [
+        n for n, r in before.items() if n != OWN_SENSORS and now_ns - r.last_report_ns <= RECENT_NS
+    ]
     senders = dict(before)
-    for name, record in before.items():
-        if name in out:
+    for name in recent:
+        record = before[name]
+        if name in side:
             errors_m.append(math.hypot(*record.mean_offset))
-            record = released(record, now_ns)
+            record = released(record, now_ns) if record.reason else record
         if not record.reason:
-            others = [n for n in before if n != OWN_SENSORS and (n in out) != (name in out)]
-            rivals = tuple(_rival(record, n, before[n]) for n in others)
-            senders[name] = replace(record, score=0.0, rivals=rivals)
+            others = [n for n in recent if (n in side) != (name in side)]
+            rivals = tuple(rival_of(before[name], n, before[n]) for n in others)
+            senders[name] = replace(without_comparisons(record), score=0.0, rivals=rivals)
     return TrustDecision(senders, True, "contested", least_sigma_m=max(errors_m))
-
-
-def _rival(record: SenderRecord, name: str, other: SenderRecord) -> Rival:
-    """Another sender beside this one, by what both said last against the estimate."""
-    (x, y), (ox, oy) = (r.mean_offset if r.score else (0.0, 0.0) for r in (record, other))
-    return Rival(name, ox - x, oy - y)
 
 
 def _assess_quarantined(
@@ -390,8 +392,7 @@ def trust_statuses(senders: SenderRecords, now_ns: int) -> tuple[TrustStatus, ..
     for name, r in sorted(senders.items()):
         if name != OWN_SENSORS and (r.quarantines or now_ns - r.last_report_ns <= RECENT_NS):
             is_only = not any(recent_senders(senders, now_ns, name))
-            reason = str(r.reason or "")
             is_contested = not r.reason and bool(open_rivals(senders, name))
-            fields = name, reason, r.since_ns, r.quarantines, is_only, is_contested
-            statuses.append(TrustStatus(*fields))
+            fields = str(r.reason or ""), r.since_ns, r.quarantines, is_only, is_contested
+            statuses.append(TrustStatus(name, *fields))
     return tuple(statuses)

@@ -7,13 +7,16 @@ from typing import Any
 import numpy as np
 import pytest
 from msgspec.structs import replace
-from support.core import SECOND
-from support.observed_drive import Drive, Observed, correct
+from support.core import CORNERS, SECOND, fix, localizer, matrix3
+from support.observed_drive import Drive, Observed, correct, faulty
 from support.trust import AGREES, RULES
 
+from cpcbl_team.config import Field, Start, Unsurveyed
 from cpcbl_team.estimate import Covariance3
 from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.geometry import Pose2
+from cpcbl_team.inflation import inflate_to
+from cpcbl_team.inputs import BeliefShared
 from cpcbl_team.mean_offsets import FadingOffsets, MeanOffset
 from cpcbl_team.sender_comparisons import OWN_SENSORS, contest_m, open_rivals
 from cpcbl_team.sender_records import (
@@ -191,3 +194,37 @@ def test_without_a_majority_sigma_holds_though_a_correct_observer_is_silent_for_
         assert drive.inside_3_sigma > 0.95
         assert math.degrees(drive.state.estimate.heading_sigma_rad) < 60.0
         assert "lost" not in drive.state.counts
+
+
+def test_where_half_are_suddenly_wrong_the_contest_lasts_and_sigma_holds() -> None:
+    """Reports in a dispute have no part in a mean, so by their means both halves agreed still, and
+    the next report ended the contest: a NEES of 6.5, once with both correct ones in quarantine."""
+    observers: dict[str, Observed] = dict.fromkeys("ab", correct)
+    observers |= {name: faulty("bias", until_s=100.0) for name in "cd"}
+    drive = Drive(observers, seed=2)
+    assert drive.state.counts["contested"] == 1
+    assert not {"a", "b"} & drive.quarantines.keys()
+    assert drive.inside_3_sigma > 0.99
+    assert np.mean(drive.nees) < 2.0
+
+
+@pytest.mark.parametrize("field", [CORNERS, Field(unsurveyed={"mast": Unsurveyed()})])
+def test_precise_reports_in_a_contest_make_no_heading_uncertain_beyond_all_numbers(
+    field: Field,
+) -> None:
+    """Each makes a position certain that the contest makes uncertain again, and covariance
+    intersection pays with the heading: after 47 s its variance was no number, and the robot's
+    process ended. (Where landmarks have no place on the map, errors are states beside the pose.)"""
+    robot = localizer(field=field, start=Start(x_m=0.0, y_m=0.0))
+    state = robot.mark_shared(robot.start(0), BeliefShared(0))
+    for i in range(1000):
+        now_ns = (i + 1) * SECOND // 10
+        estimate = inflate_to(state.estimate, 0.5, robot.settings.localizer)
+        state = state._replace(estimate=estimate, stamp_ns=now_ns)
+        said = fix(0.0, 0.0, now_ns, sensor_m=0.01, observer_m=0.02)
+        state = robot.add_fix(state, said)
+        covariance, shared = (matrix3(c) for c in state.estimate[1:])
+        assert np.isfinite(covariance).all()
+        assert math.degrees(state.estimate.heading_sigma_rad) <= 361.0
+        assert np.linalg.eigvalsh(covariance)[0] > 0.0
+        assert np.linalg.eigvalsh(covariance - shared)[0] > -1e-9

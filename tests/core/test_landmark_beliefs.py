@@ -67,13 +67,18 @@ def test_a_robot_without_a_map_takes_landmarks_where_a_teammate_says(variant: Va
     assert state.estimate.shared == state.estimate.covariance
 
 
+def without_trust(state: State, name: str) -> State:
+    """With this teammate in quarantine."""
+    expelled = SenderRecord(reason=QuarantineReason.BIASED)
+    memory = state.memory.teammates._replace(senders={name: expelled})
+    return with_teammates(state, memory)
+
+
 def test_one_in_quarantine_takes_nobody_elses_place() -> None:
     """With a better one it replaced that of a correct teammate, and was not believed itself."""
     one = robot(VAGUE_START)
     state = one.landmark_beliefs.add(one.start(0), belief_about("ne", 0))
-    expelled = SenderRecord(reason=QuarantineReason.BIASED)
-    memory = state.memory.teammates._replace(senders={"liar": expelled})
-    state = with_teammates(state, memory)
+    state = without_trust(state, "liar")
     state = one.landmark_beliefs.add(state, belief_about("ne", 0, 0.001, "liar"))
     assert state.memory.teammates.trusted_landmarks["ne"].robot == "mate"
 
@@ -114,6 +119,21 @@ def test_a_better_belief_improves_the_place_and_the_pose() -> None:
     old_pose, new_pose = before.estimate.covariance, after.estimate.covariance
     assert new_pose.determinant() < 0.1 * old_pose.determinant()
     assert after.estimate.shared == after.estimate.covariance
+
+
+def test_what_one_in_quarantine_says_changes_no_place_and_no_pose() -> None:
+    """Of places that the robot has found, and of those that it has not."""
+    vague = robot(VAGUE_START)
+    for one, before in (found(), (vague, vague.start(0))):
+        expelled = without_trust(before, "mate")
+        seen = frame(LOOP_START, before.stamp_ns + SECOND, CORNERS)
+        believed, told, without = (
+            one.cycle(state, seen)
+            for state in (after_beliefs(one, before), after_beliefs(one, expelled), expelled)
+        )
+        assert believed.estimate != without.estimate
+        assert told.estimate == without.estimate
+        assert told.common_errors == without.common_errors
 
 
 def test_a_belief_that_came_while_it_was_of_no_use_is_merged_when_the_landmark_is_seen() -> None:

@@ -11,7 +11,7 @@ from support.core import (
 from support.trust import AGREES, CONTRADICTS, RULES, Receiver
 
 from cpcbl_team.estimate import Covariance3
-from cpcbl_team.sender_comparisons import OWN_SENSORS
+from cpcbl_team.sender_comparisons import OWN_SENSORS, contest_m
 from cpcbl_team.sender_records import (
     USUAL_NIS,
     OffsetEvidence,
@@ -67,12 +67,40 @@ def test_guests_do_not_outvote_two_robots_of_the_team(receiver: Receiver) -> Non
     assert receiver.quarantined.keys() == {*GUESTS}
 
 
-def test_guests_do_not_outvote_one_robot_of_the_team(receiver: Receiver) -> None:
-    """They are one voice against its own. Nobody knows who is right, and the robot says so."""
-    receiver.receive(1.0, a=AGREES, **dict.fromkeys(GUESTS, AGREES))
-    receiver.receive(3.0, a=AGREES, **dict.fromkeys(GUESTS, CONTRADICTS))
-    assert not receiver.quarantined
-    assert ("guest0", "contested") in receiver.events
+@pytest.mark.parametrize("guests", [GUESTS[:1], GUESTS])
+def test_guests_do_not_outvote_one_robot_of_the_team(receiver: Receiver, guests: list[str]) -> None:
+    """A sudden error is decided by the earlier estimate, which this robot goes on confirming."""
+    receiver.receive(1.0, a=AGREES, **dict.fromkeys(guests, AGREES))
+    receiver.receive(3.0, a=AGREES, **dict.fromkeys(guests, CONTRADICTS))
+    assert receiver.quarantined.keys() == {*guests}
+    assert {event for _, event in receiver.events} == {"quarantined"}
+
+
+@pytest.mark.parametrize("guests", [GUESTS[:1], GUESTS])
+def test_an_estimate_that_only_guests_confirm_condemns_no_robot_of_the_team(
+    receiver: Receiver, guests: list[str]
+) -> None:
+    """They may have led it astray while the robot of the team was out of sight: both count."""
+    receiver.receive(5.0, **dict.fromkeys(guests, AGREES))
+    receiver.receive(1.0, a=CONTRADICTS, **dict.fromkeys(guests, AGREES))
+    assert receiver.quarantined == {}
+    assert receiver.events == [("a", "contested")]
+    assert all(s.contested for s in trust_statuses(receiver.senders, receiver.now_ns))
+    for name in ("a", *guests):
+        assert contest_m(receiver.senders, name) == pytest.approx(0.5)
+
+
+def test_one_distance_that_odometry_contradicts_by_chance_gives_guests_no_majority(
+    receiver: Receiver,
+) -> None:
+    """It took the only correct observer's vote as a guest began to lie: the robot followed the
+    guest by 0.5 m, sure to 3 cm, and the observer was in quarantine."""
+    receiver.receive(1.0, a=AGREES, guest0=AGREES)
+    record = receiver.senders["a"]
+    conflict = replace(record, odometry_conflicts=1.0, last_conflict_ns=receiver.now_ns)
+    receiver.senders = {**receiver.senders, "a": conflict}
+    receiver.receive(3.0, a=AGREES, guest0=CONTRADICTS)
+    assert receiver.quarantined.keys() == {"guest0"}
 
 
 def test_guests_that_are_quarantined_together_are_not_released_as_a_majority() -> None:

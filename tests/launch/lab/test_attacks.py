@@ -1,10 +1,12 @@
 """Observers that lie on purpose to one robot: the second part of `experiment liars`."""
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import pytest
 from msgspec.structs import replace
 from rich.console import Console
+from support.quarantine_use import QuarantineUse, watched_quarantines
 
 from cpcbl_launch.lab.experiments import attacks
 from cpcbl_launch.lab.experiments.attacks import Attack, AttackRow, attack_rows, run_attack
@@ -24,10 +26,29 @@ def rows_of(chosen: Sequence[Attack], seeds: Sequence[int]) -> tuple[AttackRow, 
     return attack_rows({case: [run_attack(case, seed) for seed in seeds] for case in cases})
 
 
+class Short(NamedTuple):
+    """The short attacks and the runs to compare with."""
+
+    rows: dict[tuple[str, str], AttackRow]
+    quarantines: QuarantineUse
+
+
 @pytest.fixture(scope="module")
-def short() -> dict[tuple[str, str], AttackRow]:
-    rows = rows_of([replace(EVERY[key], end_s=SHORT_S) for key in SHORT], [2])
-    return {(row.attack.name, row.attack.victim): row for row in rows}
+def runs() -> Short:
+    with watched_quarantines() as quarantines:
+        rows = rows_of([replace(EVERY[key], end_s=SHORT_S) for key in SHORT], [2])
+    return Short({(row.attack.name, row.attack.victim): row for row in rows}, quarantines)
+
+
+@pytest.fixture(scope="module")
+def short(runs: Short) -> dict[tuple[str, str], AttackRow]:
+    return runs.rows
+
+
+def test_nothing_is_used_of_a_liar_that_is_in_quarantine(runs: Short) -> None:
+    """Its weight is so small by then that the figures hardly tell."""
+    assert runs.quarantines.heard == {*attacks.TWO}
+    assert runs.quarantines.used == set()
 
 
 @pytest.mark.parametrize("key", SHORT[:2])

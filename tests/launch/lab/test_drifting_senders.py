@@ -5,6 +5,7 @@ from functools import partial
 
 import pytest
 from msgspec.structs import replace
+from support.quarantine_use import watched_quarantines
 
 from cpcbl_launch.lab.experiments import attacks, liars
 from cpcbl_launch.lab.faulty_robot import Fault, FaultyBus
@@ -95,7 +96,10 @@ def test_a_drifting_observer_that_states_a_small_sigma_is_found_and_does_little_
     fault = Fault.parse("drift:0.02,0.0,0.01@10-45")
     through = {liars.LIAR: partial(FaultyBus, fault=fault, name=liars.LIAR, start_ns=0)}
     team = liars.liars_team(liars.Case(lie="drift"))
-    _, recorder = simulate(team, 7, 45.0, bus_wrappers=through)
+    with watched_quarantines() as quarantines:
+        _, recorder = simulate(team, 7, 45.0, bus_wrappers=through)
+    assert quarantines.heard == {liars.LIAR}
+    assert quarantines.used == set()
     truth = recorder.simulated_truth()
     for name in liars.DRIVERS:
         trust = {t.peer: t for t in recorder.status[name].trust}
@@ -111,6 +115,9 @@ def test_a_drifting_observer_that_states_a_small_sigma_is_found_and_does_little_
 def test_a_sudden_error_beside_one_correct_observer_is_decided_by_the_earlier_estimate() -> None:
     """Test 3 called both observers contested before test 1 could decide; odometry was lost then."""
     case = liars.Case(lie="bias:0.5,0.5", honest=1)
-    run = liars.run_fault(case, 4)
+    with watched_quarantines() as quarantines:
+        run = liars.run_fault(case, 4)
+    assert quarantines.heard == {liars.LIAR}
+    assert quarantines.used == set()
     assert max(run.rmse_m.values()) < 0.07  # 0.17 m before
     assert {q.of for q in run.quarantines} == {liars.LIAR}
