@@ -126,6 +126,7 @@ def merge_naive(prior: Estimate, observation: Observation, scope: Scope = POSE) 
 
 _GOLDEN = 0.6180339887498949
 WIDE_RAD = math.radians(10.0)  # sigma of a heading
+LEAST_TIED = 0.02  # share of its variance that the position explains
 
 
 def merge_split(prior: Estimate, observation: Observation, scope: Scope = POSE) -> Estimate:
@@ -145,11 +146,19 @@ def merge_split(prior: Estimate, observation: Observation, scope: Scope = POSE) 
         return prior
     merged = _merge_with_weight(prior, observation, scope, weight)
     is_wider = scope is POSE and merged.covariance.hh > prior.covariance.hh > WIDE_RAD**2
-    if not is_wider or any(a for _, _, a in observation.rows):
+    if not is_wider or _tells_of_heading(prior.covariance, observation):
         return merged
     # A position would be paid for with the heading, until the robot has none
     apart = merge_split(with_all_shared(prior), observation, POSITION)
     return apart if apart.covariance.determinant() < extent else merged
+
+
+def _tells_of_heading(covariance: Covariance3, observation: Observation) -> bool:
+    """Whether the observation tells the heading: itself, or as the robot drove since it knew its
+    position."""
+    apart = covariance.position().determinant() * covariance.hh
+    is_tied = covariance.determinant() < (1.0 - LEAST_TIED) * apart
+    return is_tied or any(a for _, _, a in observation.rows)
 
 
 def best_weight(objective: Callable[[float], float]) -> tuple[float, float]:
