@@ -18,7 +18,7 @@ from cpcbl_team.miscalibration import Adaptation
 ODDS: Final = 0.03
 """Of wrong settings to right ones, before anything was seen; for each kind of error."""
 LARGEST_LOG: Final = 50.0  # of a ratio of likelihoods
-LEAST: Final = 0.05  # odds that are evidence: six times those before
+LEAST: Final = 0.2  # odds that are evidence: hardly ever those of a correct robot
 LEAST_INDEPENDENT: Final = 1e-9  # of a determinant, as a share of the product of the variances
 
 Filters = tuple[CalibrationFilter, ...]

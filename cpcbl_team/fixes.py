@@ -127,9 +127,10 @@ def _sighted_gaussian(
         mean_m = unbiased_range_m(range_m, range_sigma, bearing_sigma, share)
         turned, toward = arc_width(bearing_sigma), bearing
     else:
-        mean_m = range_m * min(math.exp(0.5 * bearing_sigma**2), 1.0 + MOST_SHIFT)
+        mean_m = range_m * math.exp(min(0.5 * bearing_sigma**2, MOST_SHIFT))
         # Of an error across, the share by which the direction is wrong is along it
-        turned, toward = bearing_sigma * max(bearing_sigma, abs(off)), bearing - off
+        turned = min(bearing_sigma * max(bearing_sigma, abs(off)), 1.0)
+        toward = bearing - off
     along_m = math.hypot(range_sigma, range_m * turned)
     _, _, covariance = sighting_gaussian(range_m, toward, along_m, bearing_sigma)
     return Gaussian2(mean_m * math.cos(bearing), mean_m * math.sin(bearing), covariance), toward

@@ -224,6 +224,18 @@ def test_a_position_tells_the_heading_of_a_robot_that_drove(tied: float, moves: 
     assert moves or merged.covariance.hh == pytest.approx(known.covariance.hh)
 
 
+@pytest.mark.parametrize("sigma_deg", [90.0, 1e6, 1e150])
+def test_a_bearing_that_says_nothing_makes_no_infinite_fix(sigma_deg: float) -> None:
+    sensor = replace(SENSOR, bearing_sigma_deg=sigma_deg)
+    first = observed(Sighting("me", 3.0, 0.1), an_observer(0), sensor)
+    assert first is not None
+    place = mean_place(None, first)
+    fix = fix_for("mate", 7 + SECOND // 10, an_observer(0), Sighting("me", 3.0, 0.2), sensor, place)
+    assert fix is not None
+    assert max(fix.sensor_covariance) < 30.0
+    assert math.hypot(fix.x_m - first.x_m, fix.y_m - first.y_m) < 6.0
+
+
 def test_the_place_of_a_teammate_is_a_mean() -> None:
     fix = observed(Sighting("me", 3.0, 0.0), an_observer(0))
     assert fix is not None
