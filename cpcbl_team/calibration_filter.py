@@ -54,7 +54,8 @@ SIGMAS: Final = 3.0  # of a bias that is believed, in each filter,
 SIGMAS_OF_SCALE: Final = 5.0  # of a scale: all filters have the odometry in common,
 SIGMAS_AGAIN: Final = 2.0  # of one that is corrected already,
 CLEAR: Final = 11.8  # and the chi-square of errors of ranges: as unlikely, with two degrees
-LEAST_SHARE: Final = 0.03  # of a range, distance or turn: what the first correction must be,
+LEAST_SHARE: Final = 0.03  # of a distance or turn: what the first correction must be,
+LEAST_SHARE_OF_RANGE: Final = 0.04  # of a range, for real sensors follow neither error exactly,
 LEAST_SHARE_AGAIN, LEAST_BIAS_AGAIN_RAD = 0.005, math.radians(0.3)  # and others
 MOST_SHARE: Final = 0.3
 ALIKE: Final = 0.5  # by less than this part of it one filter's share differs from their mean
@@ -371,7 +372,7 @@ def _range_errors(filters: Filters, present: RangeErrors) -> RangeErrors:
         return errors if off > LEAST_SHARE_AGAIN else present
     is_clear = all(chi_square > CLEAR for _, chi_square in found)
     is_clear &= all(share_of_range(one, errors) < ALIKE * off for one, _ in found)
-    return errors if is_clear and LEAST_SHARE < off < MOST_SHARE else present
+    return errors if is_clear and LEAST_SHARE_OF_RANGE < off < MOST_SHARE else present
 
 
 def _tuples(rows: list[list[float]]) -> Rows:
