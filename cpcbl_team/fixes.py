@@ -66,9 +66,9 @@ def fix_for(
     The covariances are those at the place of `earlier` fixes, for that errs apart from this
     reading: of an ellipse that is turned by the very error of its reading, and of a sigma that is a
     share of it, repeated fixes are a biased choice (Bordonaro, Willett, Bar-Shalom, Decorrelated
-    unbiased converted measurement Kalman filter, IEEE Trans. AES, 2014). The position is not that
-    of the reading itself, but see `unbiased_range_m`. The constant errors of the observer's camera
-    (`common`) are part of the observer's error.
+    unbiased converted measurement Kalman filter, IEEE Trans. AES, 2014). A first fix has but its
+    own reading: see `unbiased_range_m`. The constant errors of the observer's camera (`common`) are
+    part of the observer's error.
     """
     range_m, bearing = sighting.range_m, sighting.bearing_rad
     if range_m is None or bearing is None or sighting_fault(sighting):
