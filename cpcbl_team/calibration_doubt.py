@@ -10,8 +10,15 @@ to be corrected, a robot reports the covariance that its pose has by the mixture
 import math
 from typing import Final
 
-from cpcbl_team.calibration_filter import BEARING, FIRST_SIGMAS, OFFSET, SHARE, CalibrationFilter
-from cpcbl_team.estimate import Covariance3, Estimate
+from cpcbl_team.calibration_filter import (
+    BEARING,
+    FIRST_SIGMAS,
+    OFFSET,
+    SHARE,
+    CalibrationFilter,
+    Filters,
+)
+from cpcbl_team.estimate import Covariance3, Estimate, dot, outer
 from cpcbl_team.geometry import Pose2, wrap_angle
 from cpcbl_team.miscalibration import Adaptation
 
@@ -21,10 +28,8 @@ LARGEST_LOG: Final = 50.0  # of a ratio of likelihoods
 LEAST: Final = 0.2  # odds that are evidence: hardly ever those of a correct robot
 LEAST_INDEPENDENT: Final = 1e-9  # of a determinant, as a share of the product of the variances
 
-Filters = tuple[CalibrationFilter, ...]
 
-
-def with_probabilities(filters: Filters, present: Adaptation) -> Filters:
+def with_probabilities(filters: Filters, present: Adaptation) -> tuple[CalibrationFilter, ...]:
     """The filters that know how likely it is that the settings are wrong in the way in which each
     of them says. `present`: what of the settings is corrected already."""
     each = ODDS / max(len(filters), 1)
@@ -34,7 +39,7 @@ def with_probabilities(filters: Filters, present: Adaptation) -> Filters:
     return tuple([f._replace(probability=k * o) for f, o in zip(filters, odds, strict=True)])
 
 
-def with_doubt(estimate: Estimate, place: Pose2, filters: Filters) -> Estimate:
+def with_mixture(estimate: Estimate, place: Pose2, filters: Filters) -> Estimate:
     """The estimate with the covariance of the mixture. `place`: of the robot by odometry."""
     probability = sum([f.probability for f in filters])
     if probability == 0.0:
@@ -43,8 +48,7 @@ def with_doubt(estimate: Estimate, place: Pose2, filters: Filters) -> Estimate:
     for f in filters:
         other = f.estimate_at(place, estimate)
         x, y = other.pose.x - estimate.pose.x, other.pose.y - estimate.pose.y
-        h = wrap_angle(other.pose.heading - estimate.pose.heading)
-        apart = Covariance3(x * x, x * y, y * y, x * h, y * h, h * h)
+        apart = outer((x, y, wrap_angle(other.pose.heading - estimate.pose.heading)))
         covariance = covariance.plus(other.covariance.plus(apart), f.probability)
     return estimate._replace(covariance=covariance)
 
@@ -64,10 +68,10 @@ def _ratio(f: CalibrationFilter, present: Adaptation) -> float:
     ratio = max(_density_ratio(bias * bias / (k * bb), k * bb / first_bias**2) - 1.0, 0.0)
     covariance = Covariance3(bb, bs, ss, bo, so, oo).scaled(k)
     determinant = covariance.determinant()
-    if determinant <= LEAST_INDEPENDENT * bb * ss * oo:  # nothing but rounding
+    if determinant <= LEAST_INDEPENDENT * k**3 * bb * ss * oo:  # nothing but rounding
         return ratio
-    x, y, z = covariance.inverse().times((bias, share, offset))
-    of_all = bias * x + share * y + offset * z
+    errors = bias, share, offset
+    of_all = dot(errors, covariance.inverse().times(errors))
     shrunk = determinant / (first_bias * first_share * first_offset) ** 2
     return ratio + max(_density_ratio(of_all, shrunk) - 1.0, 0.0)
 

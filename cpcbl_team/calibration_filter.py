@@ -50,13 +50,15 @@ MOST_REJECTED: Final = 8  # in a row; then the filter begins anew
 FADING: Final = 0.99  # of the sum of the chi-squares, a sighting
 LEAST_USED: Final = 40  # sightings
 LEAST_LANDMARKS: Final = 2
-SIGMAS: Final = 3.0  # of a bias that is believed, in each filter,
-SIGMAS_OF_SCALE: Final = 5.0  # of a scale: all filters have the odometry in common,
-SIGMAS_AGAIN: Final = 2.0  # of one that is corrected already,
-CLEAR: Final = 11.8  # and the chi-square of errors of ranges: as unlikely, with two degrees
-LEAST_SHARE: Final = 0.03  # of a distance or turn: what the first correction must be,
-LEAST_SHARE_OF_RANGE: Final = 0.04  # of a range, for real sensors follow neither error exactly,
-LEAST_SHARE_AGAIN, LEAST_BIAS_AGAIN_RAD = 0.005, math.radians(0.3)  # and others
+# What an error must be in each filter, in sigmas, before it is corrected
+SIGMAS: Final = 3.0  # a bias of bearings
+CLEAR: Final = 11.8  # both errors of ranges: a chi-square that is as unlikely, with two degrees
+SIGMAS_OF_SCALE: Final = 5.0  # a scale: all filters have the odometry in common
+SIGMAS_AGAIN: Final = 2.0  # a scale that is corrected already
+# How large it must be, as a share; a correction for the first time, and a change of one
+LEAST_SHARE: Final = 0.03  # of a distance or turn
+LEAST_SHARE_OF_RANGE: Final = 0.04  # real sensors follow neither a scale nor a bias exactly
+LEAST_SHARE_AGAIN, LEAST_BIAS_AGAIN_RAD = 0.005, math.radians(0.3)
 MOST_SHARE: Final = 0.3
 ALIKE: Final = 0.5  # by less than this part of it one filter's share differs from their mean
 SETTLED_RAD: Final = math.radians(1.0)  # sigma of a bias that is known
@@ -152,11 +154,9 @@ class CalibrationFilter(NamedTuple):
         """The mean chi-square of a reading, at least 1: larger variances explain a larger one."""
         return max(self.chi_squares / max(self.readings, 1.0), 1.0)
 
-    @property
-    def bearing_bias(self) -> tuple[float, float]:
-        """What bearings are too large by, and the sigma of that (rad)."""
-        variance = self.covariance[BEARING][BEARING]
-        return self.errors[0], sqrt(self.scatter * variance)
+    def error(self, place: int) -> tuple[float, float]:
+        """One of the errors, by its place in the state (`BEARING`, ...), and its sigma."""
+        return self.errors[place - BEARING], sqrt(self.scatter * self.covariance[place][place])
 
     @property
     def range_errors(self) -> tuple[RangeErrors, float]:
@@ -337,11 +337,10 @@ def correction(filters: Filters, present: Adaptation) -> Adaptation | None:
     return None if changed == present else changed
 
 
-def _scale(filters: Filters, state: int, present: float) -> float:
-    """Of distances or turns. What the filters find is what is left of its error."""
-    found = [
-        (f.errors[state - BEARING], sqrt(f.scatter * f.covariance[state][state])) for f in filters
-    ]
+def _scale(filters: Filters, place: int, present: float) -> float:
+    """The scale of distances or turns (`place`: `DISTANCE` or `TURN`), corrected by the error that
+    the filters still find in it."""
+    found = [f.error(place) for f in filters]
     error, is_first = fmean([e for e, _ in found]), present == 1.0
     sigmas, least = (
         (SIGMAS_OF_SCALE, LEAST_SHARE) if is_first else (SIGMAS_AGAIN, LEAST_SHARE_AGAIN)
@@ -351,7 +350,7 @@ def _scale(filters: Filters, state: int, present: float) -> float:
 
 
 def _bearing_bias(filters: Filters, present_rad: float) -> float:
-    found = [f.bearing_bias for f in filters]
+    found = [f.error(BEARING) for f in filters]
     bias_rad = fmean([bias for bias, _ in found])
     if present_rad == 0.0:
         is_clear = all(abs(b) > SIGMAS * sigma and b * bias_rad > 0.0 for b, sigma in found)

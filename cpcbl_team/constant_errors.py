@@ -11,7 +11,7 @@ large by (rad).
 from math import sqrt
 from typing import Final, NamedTuple
 
-from cpcbl_team.estimate import Covariance3, Matrix3, Row
+from cpcbl_team.estimate import Covariance3, Matrix3, Row, dot
 from cpcbl_team.geometry import new
 
 LARGEST: Final = 7.0  # normalized correction: a bump is no calibration
@@ -143,7 +143,7 @@ class Evidence(NamedTuple):
         """The errors that explain the corrections."""
         covariance = self.information.inverse()
         errors = covariance.times(self.vector)
-        scatter = (self.total - _dot(errors, self.vector)) / max(self.parts, 1.0)
+        scatter = (self.total - dot(errors, self.vector)) / max(self.parts, 1.0)
         k, (xx, _, yy, _, _, hh) = sqrt(max(scatter, 1.0)), covariance
         return new(Fit, (errors, (k * sqrt(xx), k * sqrt(yy), k * sqrt(hh)), scatter))
 
@@ -166,7 +166,7 @@ class Evidence(NamedTuple):
                 parts += 1.0
         first, second, third = correction
         now = first[0], second[0], third[0]
-        lagged += _dot(now, old)
+        lagged += dot(now, old)
         information = new(Covariance3, (xx, xy, yy, xh, yh, hh))
         return new(Evidence, (information, (x, y, z), total, lagged, now, parts))
 
@@ -174,14 +174,8 @@ class Evidence(NamedTuple):
         """As if the settings had been without these errors all the time."""
         x, y, z = self.vector
         u, v, w = self.information.times(errors)
-        explained = 2.0 * _dot(errors, self.vector) - _dot(errors, (u, v, w))
+        explained = 2.0 * dot(errors, self.vector) - dot(errors, (u, v, w))
         return self._replace(vector=(x - u, y - v, z - w), total=self.total - explained)
 
 
 NO_EVIDENCE: Final = Evidence()
-
-
-def _dot(a: Row, b: Row) -> float:
-    ax, ay, az = a
-    bx, by, bz = b
-    return ax * bx + ay * by + az * bz

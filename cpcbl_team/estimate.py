@@ -97,6 +97,12 @@ def dot(a: Row, b: Row) -> float:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
+def outer(a: Row) -> Covariance3:
+    """a a^T: the covariance of an error that is a times one of variance 1."""
+    x, y, h = a
+    return Covariance3(x * x, x * y, y * y, x * h, y * h, h * h)
+
+
 class Estimate(NamedTuple):
     """Pose (field_from_robot) and covariance; see the module's text for `shared`."""
 

@@ -21,7 +21,7 @@ from cpcbl_team.sensors import sighting_fault, sighting_sigmas
 from cpcbl_team.state import FIX
 
 POSITION_SENSOR = "position sensor"
-EARLIER_NS = 1_000_000_000  # since an earlier fix, in which a teammate does not get far
+EARLIER_NS = 1_000_000_000  # after which a teammate may be far from where it was seen
 MOST_SHIFT = 0.25  # of a range; a Gaussian does not describe what is less certain
 MEAN_S = 0.3  # over which the place of a teammate is a mean
 MOST_OFF = 4.0  # sigmas of a bearing from the direction of that place
@@ -37,10 +37,14 @@ class MeanPlace(NamedTuple):
     x: float
     y: float
 
+    def is_recent(self, stamp_ns: int) -> bool:
+        """Whether the teammate cannot have got far from there."""
+        return stamp_ns - self.stamp_ns <= EARLIER_NS
+
 
 def mean_place(before: MeanPlace | None, fix: Fix) -> MeanPlace:
     """The place with this fix, too: an exponential mean."""
-    if before is None or fix.stamp_ns - before.stamp_ns > EARLIER_NS:
+    if before is None or not before.is_recent(fix.stamp_ns):
         return MeanPlace(fix.stamp_ns, fix.x_m, fix.y_m)
     k = -math.expm1(-max(fix.stamp_ns - before.stamp_ns, 0) * 1e-9 / MEAN_S)
     x, y = before.x + k * (fix.x_m - before.x), before.y + k * (fix.y_m - before.y)
@@ -63,12 +67,11 @@ def fix_for(
     field_from_observer with the sighting. An uncertain heading bends the line of sight to an arc,
     which J does not know: its variance along the line of sight is added to the observer's part. A
     heading of the teammate is the observer's plus the one in its frame, and so are their variances.
-    The covariances are those at the place of `earlier` fixes, for that errs apart from this
-    reading: of an ellipse that is turned by the very error of its reading, and of a sigma that is a
-    share of it, repeated fixes are a biased choice (Bordonaro, Willett, Bar-Shalom, Decorrelated
-    unbiased converted measurement Kalman filter, IEEE Trans. AES, 2014). A first fix has but its
-    own reading: see `unbiased_range_m`. The constant errors of the observer's camera (`common`) are
-    part of the observer's error.
+    The covariances are those at the mean place of `earlier` fixes, whose errors are others. By the
+    axes and sigmas of the readings themselves, repeated fixes would be biased (Bordonaro, Willett,
+    Bar-Shalom, Decorrelated unbiased converted measurement Kalman filter, IEEE Trans. AES, 2014).
+    A first fix has but its own reading: see `unbiased_range_m`. The constant errors of the
+    observer's camera (`common`) are part of the observer's error.
     """
     range_m, bearing = sighting.range_m, sighting.bearing_rad
     if range_m is None or bearing is None or sighting_fault(sighting):
@@ -76,8 +79,9 @@ def fix_for(
     if range_m > sensor.max_range_for_range_m:  # only its bearing is good enough
         return None
     pose, covariance = estimate.pose, estimate.covariance
-    is_late = earlier is not None and stamp_ns - earlier.stamp_ns > EARLIER_NS
-    place = None if earlier is None or is_late else pose.inverse().transform(earlier.x, earlier.y)
+    place = None
+    if earlier is not None and earlier.is_recent(stamp_ns):
+        place = pose.inverse().transform(earlier.x, earlier.y)
     sighted, toward = _sighted_gaussian(sighting, range_m, bearing, sensor, place)
     x, y = pose.transform(sighted.x, sighted.y)
     rotated = sighted.covariance.rotated(pose.heading)

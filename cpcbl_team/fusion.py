@@ -25,6 +25,7 @@ from cpcbl_team.estimate import (
     Scope,
     merge,
     offset_pose,
+    outer,
     posterior_factor,
     sharpest,
     symmetric_product,
@@ -148,7 +149,7 @@ def merge_split(prior: Estimate, observation: Observation, scope: Scope = POSE) 
     is_wider = scope is POSE and merged.covariance.hh > prior.covariance.hh > WIDE_RAD**2
     if not is_wider or _tells_of_heading(prior.covariance, observation):
         return merged
-    # A position would be paid for with the heading, until the robot has none
+    # Else each report would inflate a heading of which it tells nothing, until the robot is lost
     apart = merge_split(with_all_shared(prior), observation, POSITION)
     return apart if apart.covariance.determinant() < extent else merged
 
@@ -267,8 +268,7 @@ def _sensor_part(observation: Observation, r: Covariance2, merged: Covariance3) 
     """K R_i K^T with K = P' H^T R^-1: the part of the merged covariance that is sensor noise."""
     gains = [merged.times(row) for row in observation.rows]
     if len(gains) == 1:
-        k, (gx, gy, gh) = observation.independent.xx / (r.xx * r.xx), gains[0]
-        return Covariance3(gx * gx, gx * gy, gy * gy, gx * gh, gy * gh, gh * gh).scaled(k)
+        return outer(gains[0]).scaled(observation.independent.xx / (r.xx * r.xx))
     inverse, i = r.inverse(), observation.independent
     wxx = inverse.xx * i.xx + inverse.xy * i.xy
     wxy = inverse.xx * i.xy + inverse.xy * i.yy

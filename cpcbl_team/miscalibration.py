@@ -41,6 +41,7 @@ from cpcbl_team.estimate import (
     Matrix3,
     Row,
     Six,
+    outer,
 )
 from cpcbl_team.geometry import Pose2, new, wrap_angle
 from cpcbl_team.motion import covariance_after, distance_variance, shortening, turn_variance
@@ -339,9 +340,7 @@ def with_doubts(estimate: Estimate, check: ModelCheck) -> Estimate:
         return estimate
     covariance = estimate.covariance
     for i, variance in enumerate(check.doubts):
-        x, y, h = pose_offset(check.sensitivity, UNITS[i])
-        added = Covariance3(x * x, x * y, y * y, x * h, y * h, h * h)
-        covariance = covariance.plus(added, variance)
+        covariance = covariance.plus(outer(pose_offset(check.sensitivity, UNITS[i])), variance)
     return estimate._replace(covariance=covariance)
 
 

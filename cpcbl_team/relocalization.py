@@ -23,8 +23,10 @@ from cpcbl_team.estimate import (
     FilteredOffset,
     InformationSum,
     Row,
+    dot,
     merge,
     offset_pose,
+    outer,
 )
 from cpcbl_team.fusion import chi_square_bound
 from cpcbl_team.geometry import Pose2, wrap_angle
@@ -321,9 +323,9 @@ def _wider_covariance(
     The chi-square is the profile: that of the best pose so many sigmas along the axis. Bearings
     and dead reckoning alone give one that is steep at its least and flat far away, and curved.
     """
-    variance, (x, y, h) = _weakest_axis(estimate.covariance)
+    variance, axis = _weakest_axis(estimate.covariance)
     sigma = math.sqrt(variance)
-    profile = [_profile(estimate.pose, k * sigma, (x, y, h), used, noise) for k in STEPS]
+    profile = [_profile(estimate.pose, k * sigma, axis, used, noise) for k in STEPS]
     wider = 1.0
     for k, (least, _) in zip(STEPS, profile, strict=True):
         if not least - cost > 0.0:
@@ -331,11 +333,10 @@ def _wider_covariance(
         if k * k < FAR:
             wider = max(wider, k * k / (least - cost))
     more = variance * (min(wider, MOST_WIDENING) - 1.0)
-    along = Covariance3(x * x, x * y, y * y, x * h, y * h, h * h)
-    covariance = estimate.covariance.plus(along, more)
+    covariance = estimate.covariance.plus(outer(axis), more)
     information = covariance.inverse()
     for least, offset in profile:
-        claimed = min(_dot(offset, information.times(offset)), FAR)
+        claimed = min(dot(offset, information.times(offset)), FAR)
         if least - cost < LEAST_RISE * claimed:
             return None
     return covariance
@@ -349,17 +350,13 @@ def _profile(
     for _ in range(3):
         covariance, step, least = _filtered(offset_pose(origin, offset, POSE), used, noise)
         towards = covariance.times(axis)
-        along = _dot(axis, towards)
+        along = dot(axis, towards)
         if along <= 0.0:
             return math.nan, offset
-        k = -_dot(axis, step) / along
+        k = -dot(axis, step) / along
         least += k * k * along
         offset = _sum(_sum(offset, step), towards, k)
     return least, offset
-
-
-def _dot(a: Row, b: Row) -> float:
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 def _sum(a: Row, b: Row, k: float = 1.0) -> Row:
@@ -371,8 +368,8 @@ def _weakest_axis(covariance: Covariance3) -> tuple[float, Row]:
     axis = 1.0, 0.7, 0.4
     for _ in range(30):
         towards = covariance.times(axis)
-        axis = _sum((0.0, 0.0, 0.0), towards, 1.0 / math.sqrt(_dot(towards, towards)))
-    return _dot(axis, covariance.times(axis)), axis
+        axis = _sum((0.0, 0.0, 0.0), towards, 1.0 / math.sqrt(dot(towards, towards)))
+    return dot(axis, covariance.times(axis)), axis
 
 
 def _is_certain(estimate: Estimate) -> bool:

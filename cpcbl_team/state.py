@@ -12,7 +12,7 @@ from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from cpcbl_team.arcs import with_arc_width
-from cpcbl_team.calibration_doubt import with_doubt
+from cpcbl_team.calibration_doubt import with_mixture
 from cpcbl_team.calibration_filter import CalibrationFilter
 from cpcbl_team.common_errors import CommonErrors
 from cpcbl_team.config import Field, Start
@@ -238,7 +238,7 @@ class State(NamedTuple):
         """The estimate as it is belief to others: as uncertain as the settings are, too."""
         known = self.memory.calibration
         estimate = with_doubts(with_arc_width(self.estimate), known.check)
-        return with_doubt(estimate, self.odometry_from_robot, known.filters)
+        return with_mixture(estimate, self.odometry_from_robot, known.filters)
 
     @property
     def common_errors(self) -> CommonErrors | None:

@@ -18,7 +18,7 @@ from support.core import (
     state_at,
 )
 
-from cpcbl_team.calibration_doubt import ODDS, with_doubt, with_probabilities
+from cpcbl_team.calibration_doubt import ODDS, with_mixture, with_probabilities
 from cpcbl_team.calibration_filter import FILTERS, FIRST_SIGMAS, CalibrationFilter
 from cpcbl_team.config import SensorSettings
 from cpcbl_team.estimate import Covariance3, Estimate
@@ -107,15 +107,15 @@ def test_the_covariance_is_that_of_the_mixture() -> None:
         at.append(rng.multivariate_normal(off, 0.01 * np.eye(3), n))
     moments = np.concatenate(at)
     wanted = moments.T @ moments / len(moments)
-    xx, xy, yy, xh, yh, hh = with_doubt(estimate, HERE, (one, other)).covariance
+    xx, xy, yy, xh, yh, hh = with_mixture(estimate, HERE, (one, other)).covariance
     found = np.array([[xx, xy, xh], [xy, yy, yh], [xh, yh, hh]])
     assert found == pytest.approx(wanted, abs=0.003)
 
 
 def test_without_doubt_the_estimate_is_as_it_was() -> None:
     estimate = Estimate(HERE, diagonal(0.1, 0.1))
-    assert with_doubt(estimate, HERE, ()) is estimate
-    assert with_doubt(estimate, HERE, (started(),)) is estimate
+    assert with_mixture(estimate, HERE, ()) is estimate
+    assert with_mixture(estimate, HERE, (started(),)) is estimate
 
 
 @pytest.mark.parametrize("names", ["abcde", "ac", "e"])

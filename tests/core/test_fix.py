@@ -190,7 +190,7 @@ def test_a_teammate_that_drives_across_is_where_its_fixes_say(
     assert np.mean(np.array(squares) > 11.8) < 0.03
 
 
-def test_a_position_is_not_paid_for_with_the_heading() -> None:
+def test_reports_of_a_position_leave_a_wide_heading_as_it_is() -> None:
     """Each report of a teammate that may have errors in common with a robot inflates what is known
     already. A heading of 30° would be one of 60° after some seconds, and the robot lost."""
     observer = Estimate(Pose2(-3.0, 0.0, 0.0), diagonal(1e-3, math.radians(0.5)))
