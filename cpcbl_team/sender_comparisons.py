@@ -27,10 +27,12 @@ from cpcbl_team.mean_offsets import (
     contradicts,
     disagreement,
 )
-from cpcbl_team.sender_records import NEVER_NS, Rival, SenderRecord
+from cpcbl_team.sender_records import NEVER_NS, SILENCE_NS, Rival, SenderRecord
 
 OWN_SENSORS = ""  # stands for the robot's own sensors among the senders; no robot has this name
 RECENT_NS: Final = 3_000_000_000  # a sender takes part in disputes for so long after a report
+LEAST_CONFIRMED: Final = 20  # reports of a guest with which others agreed, until it is proven
+DOUBT_NS: Final = 60_000_000_000  # for so long new guests have the doubt about earlier ones
 SenderRecords = Mapping[str, SenderRecord]
 
 
@@ -41,6 +43,12 @@ def recent_senders(
     for name, r in senders.items():
         if name != without and not r.reason and now_ns - r.last_report_ns <= RECENT_NS:
             yield name, r
+
+
+def senders_with_a_say(senders: SenderRecords, name: str, now_ns: int) -> SenderRecords:
+    """The recent senders that count in a dispute about a report of `name`."""
+    silenced = {*doubted_guests(senders, now_ns)} - {name}
+    return {n: r for n, r in recent_senders(senders, now_ns) if n not in silenced}
 
 
 def members(senders: SenderRecords, names: Collection[str]) -> list[str]:
@@ -56,10 +64,46 @@ def votes(senders: SenderRecords, side: Collection[str], sides: Collection[str])
     return of_team + max(0, min(guests, 2 - others if others else guests))
 
 
+def doubted_guests(senders: SenderRecords, now_ns: int) -> list[str]:
+    """The guests that have neither a vote nor weight beside a robot of the team, because nobody has
+    proven them right, and another guest was in quarantine or contradicted this robot of late. A
+    guest that was caught can come back under another name: all unknown ones are one party."""
+    new = [n for n, r in senders.items() if r.is_guest and r.confirmed < LEAST_CONFIRMED]
+    team = _team_heard(senders, now_ns) if new else set()
+    is_doubt = bool(team) and any(
+        r.reason or any(rival.name in team for rival in r.rivals)
+        for r in senders.values()
+        if r.is_guest and now_ns - r.last_report_ns <= DOUBT_NS
+    )
+    return new if is_doubt else []
+
+
+def is_left_out_guest(senders: SenderRecords, name: str, now_ns: int) -> bool:
+    """Whether a report of this guest is not used: it is in doubt, or it is new and contradicts the
+    estimate beside a robot of the team. That estimate needs no news of somebody unknown."""
+    record = senders[name]
+    if not record.is_guest or record.confirmed >= LEAST_CONFIRMED:
+        return False
+    contradicts_now = record.score > 0.0 and bool(_team_heard(senders, now_ns))
+    return contradicts_now or name in doubted_guests(senders, now_ns)
+
+
+def _team_heard(senders: SenderRecords, now_ns: int) -> set[str]:
+    """The robots of the team out of quarantine that reported within the last ten seconds."""
+    return {
+        name
+        for name, r in senders.items()
+        if name != OWN_SENSORS
+        and not (r.is_guest or r.reason)
+        and now_ns - r.last_report_ns <= SILENCE_NS
+    }
+
+
 def voters(senders: SenderRecords, now_ns: int) -> list[str]:
     """The recent teammates that have a vote, as `votes` counts them. Of guests with one vote it is
     the first by name: any rule does, as long as it is one of them."""
-    recent = sorted(name for name, _ in recent_senders(senders, now_ns) if name != OWN_SENSORS)
+    silenced = {OWN_SENSORS, *doubted_guests(senders, now_ns)}
+    recent = sorted(name for name, _ in recent_senders(senders, now_ns) if name not in silenced)
     guests = [name for name in recent if senders[name].is_guest]
     return members(senders, recent) + guests[: votes(senders, guests, recent)]
 
@@ -67,15 +111,18 @@ def voters(senders: SenderRecords, now_ns: int) -> list[str]:
 def voting_means(senders: SenderRecords, now_ns: int, name: str, of: int) -> dict[str, MeanOffset]:
     """The precise means (`of`: FAST or SLOW) of the recent sources but `name`, and of the silent
     parties of contests with them; of guests as far as they have a vote, see `votes`."""
+    silenced = doubted_guests(senders, now_ns)
     means = {
         other: mean
         for other, r in recent_senders(senders, now_ns, name)
-        if (mean := r.means[of]) is not None
+        if other not in silenced
+        and (mean := r.means[of]) is not None
         and mean.is_precise
         and now_ns - r.offsets[of].stamp_ns <= RECENT_NS
     }
     means = _with_votes(senders, name, means, of)
-    means |= _means_of_silent(senders, name, means, now_ns, of)
+    silent = _means_of_silent(senders, name, means, now_ns, of)
+    means |= {other: mean for other, mean in silent.items() if other not in silenced}
     return _with_votes(senders, name, means, of)
 
 

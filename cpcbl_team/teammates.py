@@ -36,6 +36,7 @@ from cpcbl_team.measurements import (
 )
 from cpcbl_team.recovery_evidence import without_senders
 from cpcbl_team.sender_comparisons import (
+    LEAST_CONFIRMED,
     OWN_SENSORS,
     RECENT_NS,
     SenderRecords,
@@ -45,7 +46,6 @@ from cpcbl_team.sender_comparisons import (
 from cpcbl_team.sender_records import NEVER_NS, OffsetEvidence, ReportedPosition, TeammateReport
 from cpcbl_team.state import State, with_memory, with_senders, with_teammates
 
-LEAST_CONFIRMED = 20  # reports of a guest beside which others agreed, until it counts as the others
 INDEPENDENT_FRAMES = 0.1  # of a camera: the next frame has nearly the same errors of tilt and edges
 CHANGING_M2 = 0.05**2  # the most of the variance (xx + yy) that is another error at the next report
 FARTHEST_OFFSET_M = 1.0  # of what a frame tells of the position, where it tells little

@@ -7,9 +7,8 @@ other senders (`sender_comparisons.py`).
 A sender whose score against the estimate exceeds the limit is in dispute with it. The dispute is
 decided against the sender only if somebody else supported the estimate since it began: the robot's
 own sensors, or at least as many teammates as dissent. If most dissent, the estimate is wrong, and
-so are the senders that it followed. A sender that contradicts odometry again and again is wrong
-without a second opinion, and so is one whose mean contradicts the robot's own sensors, or, without
-these, a majority of the senders.
+so are those that it followed. A sender that contradicts odometry again and again is wrong without a
+second opinion, and so is one whose mean contradicts own sensors, or else a majority of senders.
 
 A sender that is wrong is quarantined: its reports are not used, but they are still tested. It is
 readmitted after its reports were right for some time (docs/trust.md).
@@ -30,10 +29,12 @@ from cpcbl_team.sender_comparisons import (
     SenderRecords,
     compare,
     contest_m,
+    is_left_out_guest,
     members,
     open_rivals,
     recent_senders,
     rival_of,
+    senders_with_a_say,
     votes,
     voting_means,
     with_comparison,
@@ -124,7 +125,8 @@ def assess(
     if out:
         decision = _without_decision(decision, out, report.stamp_ns)
     least_m = max(decision.least_sigma_m, contest_m(decision.senders, name))
-    return decision._replace(least_sigma_m=least_m)
+    is_used = decision.trusted and not is_left_out_guest(decision.senders, name, report.stamp_ns)
+    return decision._replace(trusted=is_used, least_sigma_m=least_m)
 
 
 def _decide(
@@ -182,7 +184,7 @@ def _decide_dispute(
     """Decides who is wrong if a sender has contradicted the estimate for long enough. A source
     supports the estimate only if it agreed with it after the dispute began. If none does, no sender
     is blamed: the robot detects by its innovations that it is lost."""
-    recent = dict(recent_senders(senders, now_ns))
+    recent = senders_with_a_say(senders, name, now_ns)
     disputes_ns = [r.dispute_since_ns for r in recent.values() if r.score > rules.limit]
     if not disputes_ns:
         return TrustDecision(senders, True)

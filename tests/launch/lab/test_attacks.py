@@ -85,6 +85,16 @@ def test_one_that_is_certain_along_one_axis_only_leads_nobody_astray(
     assert row.false_quarantines == 0
 
 
+def test_a_guest_of_ever_new_names_leads_nobody_astray_beside_one_correct_observer() -> None:
+    """Each new name was used before anybody could have contradicted it."""
+    attack = replace(EVERY["new names, one robot", "scout"], liars=attacks.GUEST, end_s=24.0)
+    _, row = rows_of([attack], [1])
+    assert row.noticed == 1
+    assert row.worst_ratio < 1.2  # 4.6 before
+    assert row.least_inside_3_sigma > 0.99  # 96 % before
+    assert row.false_quarantines == 0
+
+
 def test_the_runs_to_compare_with_have_no_liar(short: dict[tuple[str, str], AttackRow]) -> None:
     for key in (("", "scout"), ("", "navigator")):
         assert short[key].worst_ratio == 1.0

@@ -107,6 +107,7 @@ def attacks() -> tuple[Attack, ...]:
         replace(drift, name="five guests", liars=GUESTS),
         replace(sudden, name="five guests at once", liars=GUESTS),
         replace(renamed, name="guests with new names", liars=GUESTS),
+        replace(renamed, name="new names, one robot", liars=GUESTS, honest=("north",)),
         replace(sudden, name="guests, one robot", liars=GUESTS, honest=("north",), most_ratio=None),
     ]
     return tuple(replace(case, lie=case.lie.format(victim=case.victim)) for case in cases)
@@ -210,7 +211,7 @@ def attack_tables(rows: Sequence[AttackRow], seeds: int) -> Iterable[RenderableT
     yield shown
     yield (
         "A scout has one liar beside two correct observers, a navigator two (but one\n"
-        "guest); without a majority a scout has two. Where guests lie there are five, once\n"
+        "guest); without a majority a scout has two. Where guests lie there are five, twice\n"
         "beside one correct observer. Column m is the median RMSE; worst\n"
         "is the largest ratio of a seed to the same seed without liars. The aim is at most\n"
         f"{BLIND_RATIO:g} for a scout and {OWN_EYES_RATIO:g} for a navigator; "
