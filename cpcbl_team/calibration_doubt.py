@@ -12,31 +12,50 @@ from typing import Final
 
 from cpcbl_team.calibration_filter import (
     BEARING,
+    DISTANCE,
     FIRST_SIGMAS,
-    OFFSET,
-    SHARE,
+    LEAST_INDEPENDENT,
+    TURN,
     CalibrationFilter,
     Filters,
+    Rows,
 )
 from cpcbl_team.estimate import Covariance3, Estimate, dot, outer
 from cpcbl_team.geometry import Pose2, wrap_angle
 from cpcbl_team.miscalibration import Adaptation
+from cpcbl_team.range_errors import NO_RANGE_ERRORS
 
 ODDS: Final = 0.03
 """Of wrong settings to right ones, before anything was seen; for each kind of error."""
+CONTRADICTION: Final = 16.3  # chi-square of two poses, which 0.1 % of correct ones exceed
+CHORD_FACTOR: Final = 2.0
+"""On the variance of a scale: the filters know the odometry's noise on the chord of each way only,
+which is less than on the way itself."""
 LARGEST_LOG: Final = 50.0  # of a ratio of likelihoods
 LEAST: Final = 0.2  # odds that are evidence: hardly ever those of a correct robot
-LEAST_INDEPENDENT: Final = 1e-9  # of a determinant, as a share of the product of the variances
 
 
-def with_probabilities(filters: Filters, present: Adaptation) -> tuple[CalibrationFilter, ...]:
+def with_probabilities(
+    filters: Filters, present: Adaptation, estimate: Estimate, place: Pose2
+) -> tuple[CalibrationFilter, ...]:
     """The filters that know how likely it is that the settings are wrong in the way in which each
-    of them says. `present`: what of the settings is corrected already."""
-    each = ODDS / max(len(filters), 1)
-    odds = [each * _ratio(f, present) for f in filters]
+    of them says. `present`: what of the settings is corrected already. Where they agree about
+    another pose than the robot's own `estimate` (at `place` by odometry), one of both is wrong, and
+    nothing says which: either the settings are, or the robot is elsewhere than it was led."""
+    share = 1.0 / max(len(filters), 1)
+    if _contradict(filters, estimate, place):
+        odds = [share for _ in filters]
+    else:
+        odds = [share * ODDS * _ratio(f, present) for f in filters]
     every = sum(odds)
     k = 1.0 / (1.0 + every) if every > LEAST else 0.0
     return tuple([f._replace(probability=k * o) for f, o in zip(filters, odds, strict=True)])
+
+
+def with_doubt(estimate: Estimate, place: Pose2, filters: Filters, present: Adaptation) -> Estimate:
+    """The estimate as it is if the settings may be wrong. `place`: of the robot by odometry;
+    `present`: what of the settings is corrected already."""
+    return with_mixture(with_remaining_errors(estimate, filters, present), place, filters)
 
 
 def with_mixture(estimate: Estimate, place: Pose2, filters: Filters) -> Estimate:
@@ -53,27 +72,78 @@ def with_mixture(estimate: Estimate, place: Pose2, filters: Filters) -> Estimate
     return estimate._replace(covariance=covariance)
 
 
+def with_remaining_errors(estimate: Estimate, filters: Filters, present: Adaptation) -> Estimate:
+    """The estimate with what is not known yet of the errors of the sensor, where one of them is
+    corrected: the part of the pose's covariance that is theirs in the first filter, P_xe P_ee^-1
+    P_ex (as of the states that a Schmidt-Kalman filter considers; Jazwinski 1970, section 8.4)."""
+    is_corrected = present.bearing_bias_rad != 0.0 or present.ranges != NO_RANGE_ERRORS
+    if not filters or not is_corrected:
+        return estimate
+    rows, k = filters[0].covariance, filters[0].scatter
+    errors = _sensor_covariance(rows)
+    if _is_singular(errors):
+        return estimate
+    inverse = errors.inverse()
+    x, y, heading = [inverse.times((a, b, c)) for _, _, _, a, b, c, _, _ in rows[:BEARING]]
+    added = errors.transformed((*x, *y, *heading))
+    return estimate._replace(covariance=estimate.covariance.plus(added, k))
+
+
+def _sensor_covariance(rows: Rows) -> Covariance3:
+    """Of the bias of bearings, and the share and the bias of ranges."""
+    bearing, share, offset = [row[BEARING:DISTANCE] for row in rows[BEARING:DISTANCE]]
+    return Covariance3(bearing[0], share[0], share[1], offset[0], offset[1], offset[2])
+
+
+def _is_singular(c: Covariance3) -> bool:
+    """Whether nothing but rounding is left of a covariance's determinant."""
+    return c.determinant() <= LEAST_INDEPENDENT * c.xx * c.yy * c.hh
+
+
+def _contradict(filters: Filters, estimate: Estimate, place: Pose2) -> bool:
+    """Whether the robot is elsewhere by all these filters, and at one place."""
+    known = [f.estimate_at(place, estimate) for f in filters]
+    return all(_are_apart(k, estimate) and not _are_apart(k, known[0]) for k in known)
+
+
+def _are_apart(one: Estimate, other: Estimate) -> bool:
+    """Whether two poses cannot be one and the same."""
+    x, y = one.pose.x - other.pose.x, one.pose.y - other.pose.y
+    apart = x, y, wrap_angle(one.pose.heading - other.pose.heading)
+    covariance = one.covariance.plus(other.covariance)
+    if _is_singular(covariance):
+        return False
+    return dot(apart, covariance.inverse().times(apart)) > CONTRADICTION
+
+
 def _ratio(f: CalibrationFilter, present: Adaptation) -> float:
-    """How much likelier the sightings are with a bias of bearings, and with that and wrong ranges,
-    than with the settings as they are; what speaks for these does not count."""
-    bias, share, offset, _, _ = f.errors
-    k, rows = f.scatter, f.covariance
-    bias -= present.bearing_bias_rad
-    share, offset = share - present.ranges.share, offset - present.ranges.bias_m
-    bb, bs, bo = rows[BEARING][BEARING], rows[BEARING][SHARE], rows[BEARING][OFFSET]
-    ss, so, oo = rows[SHARE][SHARE], rows[SHARE][OFFSET], rows[OFFSET][OFFSET]
-    if min(bb, ss, oo) <= 0.0:
+    """How much likelier the sightings are with a bias of bearings, with that and wrong ranges, or
+    with a wrong scale of the odometry, than with the settings as they are; what speaks for these
+    does not count."""
+    found, first = f.errors, FIRST_SIGMAS
+    errors = (
+        found[0] - present.bearing_bias_rad,
+        found[1] - present.ranges.share,
+        found[2] - present.ranges.bias_m,
+    )
+    covariance = _sensor_covariance(f.covariance).scaled(f.scatter)
+    if min(covariance.xx, covariance.yy, covariance.hh) <= 0.0:
         return 0.0
-    first_bias, first_share, first_offset, _, _ = FIRST_SIGMAS
-    ratio = max(_density_ratio(bias * bias / (k * bb), k * bb / first_bias**2) - 1.0, 0.0)
-    covariance = Covariance3(bb, bs, ss, bo, so, oo).scaled(k)
-    determinant = covariance.determinant()
-    if determinant <= LEAST_INDEPENDENT * k**3 * bb * ss * oo:  # nothing but rounding
-        return ratio
-    errors = bias, share, offset
-    of_all = dot(errors, covariance.inverse().times(errors))
-    shrunk = determinant / (first_bias * first_share * first_offset) ** 2
-    return ratio + max(_density_ratio(of_all, shrunk) - 1.0, 0.0)
+    ratios = [_single_ratio(errors[0], covariance.xx, first[0])]
+    for place in (DISTANCE, TURN):
+        error, sigma = f.error(place)
+        variance = CHORD_FACTOR * sigma * sigma
+        ratios.append(_single_ratio(error, variance, first[place - BEARING]))
+    if not _is_singular(covariance):
+        chi_square = dot(errors, covariance.inverse().times(errors))
+        shrunk = covariance.determinant() / (first[0] * first[1] * first[2]) ** 2
+        ratios.append(_density_ratio(chi_square, shrunk))
+    return sum([max(ratio - 1.0, 0.0) for ratio in ratios])
+
+
+def _single_ratio(error: float, variance: float, first_sigma: float) -> float:
+    """That of one error."""
+    return _density_ratio(error * error / variance, variance / first_sigma**2)
 
 
 def _density_ratio(chi_square: float, shrunk: float) -> float:

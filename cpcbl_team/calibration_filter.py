@@ -45,10 +45,13 @@ POSITION_VARIANCE, HEADING_VARIANCE = 0.5**2, math.radians(20.0) ** 2
 """What is added to those of the robot's own pose (m^2, rad^2) where this filter begins."""
 SPACING_NS: Final = 1_000_000_000  # between two sightings of a landmark
 LONGEST_NS: Final = 10_000_000_000  # between two frames: of a longer way the path matters
+STRIDE_NS: Final = 3_000_000_000  # without sightings it follows the odometry in such steps
 GATE: Final = 16.0  # chi-square of a sighting; 0.03 % of correct ones are beyond
 MOST_REJECTED: Final = 8  # in a row; then the filter begins anew
 FADING: Final = 0.99  # of the sum of the chi-squares, a sighting
-LEAST_USED: Final = 40  # sightings
+DETERMINED: Final = 4  # sightings have as many readings as it has states
+LEAST_USED: Final = 40  # sightings,
+FEWEST_USED: Final = 12  # if the error is as much clearer
 LEAST_LANDMARKS: Final = 2
 # What an error must be in each filter, in sigmas, before it is corrected
 SIGMAS: Final = 3.0  # a bias of bearings
@@ -60,7 +63,8 @@ LEAST_SHARE: Final = 0.03  # of a distance or turn
 LEAST_SHARE_OF_RANGE: Final = 0.04  # real sensors follow neither a scale nor a bias exactly
 LEAST_SHARE_AGAIN, LEAST_BIAS_AGAIN_RAD = 0.005, math.radians(0.3)
 MOST_SHARE: Final = 0.3
-ALIKE: Final = 0.5  # by less than this part of it one filter's share differs from their mean
+ALIKE: Final = 0.5  # by less than this part of it what one filter finds differs from their mean
+LEAST_INDEPENDENT: Final = 1e-9  # of a determinant, as a share of the product of the variances
 SETTLED_RAD: Final = math.radians(1.0)  # sigma of a bias that is known
 
 Rows = tuple[tuple[float, ...], ...]
@@ -104,18 +108,21 @@ class CalibrationFilter(NamedTuple):
     metres: float = 0.0  # and the sum of their ranges
     rejected: int = 0  # in a row
     probability: float = 0.0  # that the settings are wrong as it says (`calibration_doubt.py`)
+    gaps: int = 0  # in the odometry, before the way on which it was led here
 
     @staticmethod
-    def at(stamp_ns: int, place: Pose2, estimate: Estimate) -> "CalibrationFilter":
+    def at(stamp_ns: int, place: Pose2, estimate: Estimate, gaps: int = 0) -> "CalibrationFilter":
         """A filter that knows nothing of the errors. `place`: of the robot by odometry."""
         rows = [[0.0] * SIZE for _ in range(SIZE)]
         for i, sigma in enumerate(FIRST_SIGMAS):
             rows[BEARING + i][BEARING + i] = sigma * sigma
         errors = (0.0,) * len(FIRST_SIGMAS)
         found = CalibrationFilter(stamp_ns, place, estimate.pose, errors, _tuples(rows))
-        return found.with_pose(stamp_ns, place, estimate)
+        return found.with_pose(stamp_ns, place, estimate, gaps)
 
-    def with_pose(self, stamp_ns: int, place: Pose2, estimate: Estimate) -> "CalibrationFilter":
+    def with_pose(
+        self, stamp_ns: int, place: Pose2, estimate: Estimate, gaps: int = 0
+    ) -> "CalibrationFilter":
         """With the pose of the robot's own filter, for its way until now is not known well."""
         rows = [[0.0] * BEARING + list(row[BEARING:]) for row in self.covariance]
         xx, xy, yy, xh, yh, hh = estimate.covariance
@@ -129,6 +136,7 @@ class CalibrationFilter(NamedTuple):
             pose=estimate.pose,
             covariance=_tuples(rows),
             rejected=0,
+            gaps=gaps,
         )
 
     def after(
@@ -165,7 +173,10 @@ class CalibrationFilter(NamedTuple):
         ss, so = self.covariance[SHARE][SHARE], self.covariance[SHARE][OFFSET]
         oo = self.covariance[OFFSET][OFFSET]
         square = oo * share * share - 2.0 * so * share * offset + ss * offset * offset
-        return RangeErrors(share, offset), square / ((ss * oo - so * so) * self.scatter)
+        determinant = ss * oo - so * so
+        if determinant <= LEAST_INDEPENDENT * ss * oo:
+            return RangeErrors(share, offset), 0.0
+        return RangeErrors(share, offset), square / (determinant * self.scatter)
 
     def share_of_range(self, one: RangeErrors, other: RangeErrors) -> float:
         """By which share of it a range differs with both, of one of half and of one and a half of
@@ -201,6 +212,7 @@ class _Update:
         self._used_ns = dict(before.used_ns)
         self._chi_squares, self._readings = before.chi_squares, before.readings
         self._used, self._metres, self._rejected = before.used, before.metres, before.rejected
+        self._gaps = before.gaps
 
     def move(self, stamp_ns: int, place: Pose2, noise: OdometryNoise) -> None:
         """To where the odometry has led by this time: pose' = pose + arc(errors)."""
@@ -311,7 +323,7 @@ class _Update:
         parts = (
             self._stamp_ns, self._place, new(Pose2, (x, y, wrap_angle(heading))), tuple(errors),
             _tuples(self._rows), self._used_ns, self._chi_squares, self._readings, self._used,
-            self._metres, self._rejected, 0.0,
+            self._metres, self._rejected, 0.0, self._gaps,
         )  # fmt: skip
         return new(CalibrationFilter, parts)
 
@@ -323,21 +335,23 @@ Filters = Sequence[CalibrationFilter]
 def correction(filters: Filters, present: Adaptation) -> Adaptation | None:
     """The settings with the errors that are clear to each filter, and large enough to be worth it;
     None if that changes nothing. What is corrected already follows what is known."""
-    if any(f.used < LEAST_USED or len(f.used_ns) < LEAST_LANDMARKS for f in filters):
+    if any(f.used < FEWEST_USED or len(f.used_ns) < LEAST_LANDMARKS for f in filters):
         return None
-    ranges = _range_errors(filters, present.ranges)
+    # Of few sightings it must be clearer, for what they err by together is hardly known
+    k = max(1.0, LEAST_USED / min([f.used for f in filters]))
+    ranges = _range_errors(filters, present.ranges, k)
     are_new = present.ranges == NO_RANGE_ERRORS != ranges  # what was found with wrong ones is void
-    bias_rad = _bearing_bias(filters, 0.0 if are_new else present.bearing_bias_rad)
+    bias_rad = _bearing_bias(filters, 0.0 if are_new else present.bearing_bias_rad, k)
     changed = present._replace(
-        distance_scale=_scale(filters, DISTANCE, present.distance_scale),
-        turn_scale=_scale(filters, TURN, present.turn_scale),
+        distance_scale=_scale(filters, DISTANCE, present.distance_scale, k),
+        turn_scale=_scale(filters, TURN, present.turn_scale, k),
         bearing_bias_rad=bias_rad,
         ranges=ranges,
     )
     return None if changed == present else changed
 
 
-def _scale(filters: Filters, place: int, present: float) -> float:
+def _scale(filters: Filters, place: int, present: float, k: float) -> float:
     """The scale of distances or turns (`place`: `DISTANCE` or `TURN`), corrected by the error that
     the filters still find in it."""
     found = [f.error(place) for f in filters]
@@ -345,22 +359,30 @@ def _scale(filters: Filters, place: int, present: float) -> float:
     sigmas, least = (
         (SIGMAS_OF_SCALE, LEAST_SHARE) if is_first else (SIGMAS_AGAIN, LEAST_SHARE_AGAIN)
     )
-    is_clear = all(abs(e) > sigmas * sigma and e * error > 0.0 for e, sigma in found)
+    is_clear = _is_clear(found, error, sigmas * sqrt(k))
     return present * (1.0 + error) if is_clear and least < abs(error) < MOST_SHARE else present
 
 
-def _bearing_bias(filters: Filters, present_rad: float) -> float:
+def _is_clear(found: Sequence[tuple[float, float]], mean: float, sigmas: float) -> bool:
+    """Whether all filters are so sure of an error (each with its sigma), and agree about it."""
+    return all(
+        abs(e) > sigmas * sigma and e * mean > 0.0 and abs(e - mean) < ALIKE * abs(mean)
+        for e, sigma in found
+    )
+
+
+def _bearing_bias(filters: Filters, present_rad: float, k: float) -> float:
     found = [f.error(BEARING) for f in filters]
     bias_rad = fmean([bias for bias, _ in found])
     if present_rad == 0.0:
-        is_clear = all(abs(b) > SIGMAS * sigma and b * bias_rad > 0.0 for b, sigma in found)
+        is_clear = _is_clear(found, bias_rad, SIGMAS * sqrt(k))
         return bias_rad if is_clear and LEAST_BIAS_RAD < abs(bias_rad) < MOST_BIAS_RAD else 0.0
     is_known = all(sigma < SETTLED_RAD for _, sigma in found)
     is_off = abs(bias_rad - present_rad) > LEAST_BIAS_AGAIN_RAD
     return bias_rad if is_known and is_off else present_rad
 
 
-def _range_errors(filters: Filters, present: RangeErrors) -> RangeErrors:
+def _range_errors(filters: Filters, present: RangeErrors, k: float) -> RangeErrors:
     found = [f.range_errors for f in filters]
     errors = RangeErrors(
         fmean([one.share for one, _ in found]), fmean([one.bias_m for one, _ in found])
@@ -369,7 +391,7 @@ def _range_errors(filters: Filters, present: RangeErrors) -> RangeErrors:
     off = share_of_range(errors, present)
     if present != NO_RANGE_ERRORS:
         return errors if off > LEAST_SHARE_AGAIN else present
-    is_clear = all(chi_square > CLEAR for _, chi_square in found)
+    is_clear = all(chi_square > k * CLEAR for _, chi_square in found)
     is_clear &= all(share_of_range(one, errors) < ALIKE * off for one, _ in found)
     return errors if is_clear and LEAST_SHARE_OF_RANGE < off < MOST_SHARE else present
 

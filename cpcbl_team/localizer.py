@@ -113,7 +113,8 @@ class Localizer:
         state = self.predict(state, now)  # 1. differential motion
         state, scope, landmarks, others = self.measure(state, frame)  # 2. measurements
         if scope is None:  # nothing may be updated
-            return self.recovery.check(state)
+            known = self._calibration.after_rejected(state) if state.lost else state
+            return self.recovery.check(known)
         gated = _NO_OBJECTS
         if others:
             state, gated = self._gate.constrain(state, others, scope)  # 3. constraints
@@ -264,7 +265,9 @@ class Localizer:
         window = with_innovations(updates.innovations, accepted, rejected, self._window)
         updates = updates_with_frame(updates, now, scope, used, rejected, window)
         state = with_correction(state, estimate, updates)
-        return self._calibration.after_update(state) if accepted else state
+        if accepted:
+            return self._calibration.after_update(state)
+        return self._calibration.after_rejected(state) if rejected else state
 
     # Teammates and the position sensor --------------------------------------------------------
 

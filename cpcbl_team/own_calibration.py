@@ -14,6 +14,7 @@ from cpcbl_team.calibration_filter import (
     FILTERS,
     LONGEST_NS,
     MOST_REJECTED,
+    STRIDE_NS,
     CalibrationFilter,
     Frame,
     SeenLandmark,
@@ -21,7 +22,7 @@ from cpcbl_team.calibration_filter import (
 )
 from cpcbl_team.config import Field, LocalizationSettings, OdometryNoise
 from cpcbl_team.constant_errors import NO_ERRORS, NO_EVIDENCE, pose_offset
-from cpcbl_team.estimate import POSE, offset_pose
+from cpcbl_team.estimate import POSE, Estimate, offset_pose
 from cpcbl_team.geometry import new
 from cpcbl_team.landmarks import Landmarks, LandmarkUpdate
 from cpcbl_team.map_residuals import ResidualSums
@@ -45,11 +46,19 @@ from cpcbl_team.miscalibration import (
 )
 from cpcbl_team.motion import NO_VARIANCE, MotionVariance, distance_variance, turn_variance
 from cpcbl_team.range_errors import NO_RANGE_ERRORS
-from cpcbl_team.recovery_evidence import SPACING_NS
+from cpcbl_team.recovery_evidence import SPACING_NS, WINDOW_NS
+from cpcbl_team.rough_pose import rough_pose
 from cpcbl_team.self_calibration import ReferencePose, ReferencePoses, self_calibrate
-from cpcbl_team.state import CalibrationMemory, Evidence, State, with_calibration
+from cpcbl_team.state import (
+    CalibrationMemory,
+    Evidence,
+    State,
+    with_calibration,
+    with_recovery,
+)
 
-MOST_BEGIN_M: Final = 0.5  # sigma of a position with which the second filter begins
+MOST_BEGIN_M, MOST_BEGIN_RAD = 0.5, math.radians(15.0)  # sigmas with which a filter begins
+ROUGH_NS: Final = 5_000_000_000  # so often a lost robot looks for such a pose
 
 
 class OwnCalibration:
@@ -65,7 +74,7 @@ class OwnCalibration:
         )
         # Of two that contradict each other either one may be wrong
         self._names_misplaced = len(field.names) > 2
-        self._names_of_landmarks = frozenset(field.landmarks)
+        self._field, self._names_of_landmarks = field, frozenset(field.landmarks)
         block_s = BLOCK_NS * 1e-9
         correlation_s, spacing_s = settings.sensor.correlation_s, SPACING_NS * 1e-9
         self._rules = Rules(
@@ -74,7 +83,9 @@ class OwnCalibration:
             knows_covariance=rules.variant != "circular",
         )
         self._correlation_s, names = correlation_s, sorted(field.landmarks)
-        self._left_out = [frozenset(names[i::FILTERS]) for i in range(FILTERS)]
+        self._left_out = [
+            frozenset(names[i::FILTERS] if self._names_misplaced else ()) for i in range(FILTERS)
+        ]
         self._independent_frames = spacing_s / (spacing_s + 2.0 * correlation_s)
 
     def is_known(self, state: State) -> bool:
@@ -139,6 +150,20 @@ class OwnCalibration:
             return self._with_check(state, check.with_place(now_ns, place), present)
         return state
 
+    def after_rejected(self, state: State) -> State:
+        """The state after a frame of which nothing was accepted: the error for which the robot
+        rejects what it measures may be one of its sensor."""
+        filters = state.memory.calibration.filters
+        is_due = not filters or state.stamp_ns - filters[0].stamp_ns >= BLOCK_NS
+        return self._with_filters(state) if is_due and self._is_checked else state
+
+    def after_odometry(self, state: State) -> State:
+        """The state whose second filters have followed the odometry, where nothing is seen."""
+        _, _, _, _, _, _, filters, *_ = state.memory.calibration
+        if not filters or state.stamp_ns - filters[0].stamp_ns < STRIDE_NS:
+            return state
+        return self._with_filters(state)
+
     def without_adaptation(self, state: State) -> State:
         """The state without what the robot noticed of its settings and of its map so far."""
         memory, check = state.memory.calibration, ModelCheck(accepted=state.updates.accepted)
@@ -185,16 +210,19 @@ class OwnCalibration:
         the errors of the sensor that these are sure of corrected."""
         memory, filters = state.memory.calibration, self._filters_after(state)
         if not filters:
-            return state
+            has_looked = bool(state.lost) and self._is_rough_due(state)
+            rough_ns = state.stamp_ns if has_looked else memory.rough_ns
+            return with_calibration(state, memory._replace(filters=(), rough_ns=rough_ns))
         present = memory.adaptation
-        changed = correction(filters, present)
+        changed = correction(filters, present) if self._may_correct(state) else None
         if changed is None:
-            filters = with_probabilities(filters, present)
+            estimate, place = state.estimate, state.odometry_from_robot
+            filters = with_probabilities(filters, present, estimate, place)
             return with_calibration(state, memory._replace(filters=filters))
         is_first = present.bearing_bias_rad == 0.0 != changed.bearing_bias_rad
         is_first |= present.ranges == NO_RANGE_ERRORS != changed.ranges
         if not is_first:
-            is_new = errors_between(AS_CONFIGURED, present) == NO_ERRORS
+            is_new = present._replace(motion_factor=1.0, sensor_factor=1.0) == AS_CONFIGURED
             check = memory.check.restarted(state.updates.accepted)
             memory = memory._replace(filters=filters, check=check)
             state = _with_adaptation(with_calibration(state, memory), changed)
@@ -207,25 +235,37 @@ class OwnCalibration:
         only = AS_CONFIGURED._replace(bearing_bias_rad=bias_rad, ranges=ranges)
         state = self.without_adaptation(state.counted("miscalibrated"))
         memory = state.memory.calibration._replace(filters=filters, adaptation=only)
-        state = state._replace(estimate=filters[0].estimate_at(place, estimate))
-        return with_calibration(state, memory)
+        state = with_calibration(state, memory)
+        return _at_pose(state, filters[0].estimate_at(place, estimate))
+
+    def _may_correct(self, state: State) -> bool:
+        """Whether wrong settings may be corrected: a wrong distance between the only two landmarks
+        of a map looks like wrong ranges, and where the robot once found that one is misplaced, that
+        is as likely."""
+        is_corrected = state.memory.calibration.adaptation.ranges != NO_RANGE_ERRORS
+        return self._names_misplaced or is_corrected or not state.memory.recovery.misplaced
 
     def _filters_after(self, state: State) -> tuple[CalibrationFilter, ...]:
         """The second filters after the landmarks that were seen since; empty before they begin."""
         now_ns, estimate, place, odometry, until_ns, _, (recovery, _, memory, events) = state
-        filters, begin = memory.filters, memory.check.begin
-        if recovery.lost or memory.common is not None or not self._names_of_landmarks:
+        filters, gaps = memory.filters, events.get("odometry_gap", 0)
+        if memory.common is not None or not self._names_of_landmarks:
             return filters
+        is_known = not recovery.lost and estimate.position_sigma_m < MOST_BEGIN_M
         if not filters or any(f.rejected > MOST_REJECTED for f in filters):
-            is_known = estimate.position_sigma_m < MOST_BEGIN_M
-            new_one = CalibrationFilter.at(now_ns, place, estimate)
-            return (new_one,) * FILTERS if is_known else ()
-        is_broken = begin is None or events.get("odometry_gap", 0) > begin.gaps
+            is_known &= estimate.heading_sigma_rad < MOST_BEGIN_RAD
+            begin = estimate if is_known else self._rough_estimate(state)
+            if begin is None:
+                return ()
+            return (CalibrationFilter.at(now_ns, place, begin, gaps),) * FILTERS
+        is_broken = gaps > filters[0].gaps or now_ns - filters[0].stamp_ns > LONGEST_NS
         is_broken |= odometry is not None and until_ns < now_ns
-        is_broken |= now_ns - filters[0].stamp_ns > LONGEST_NS
         if is_broken:
-            return tuple([f.with_pose(now_ns, place, estimate) for f in filters])
+            known = [f.with_pose(now_ns, place, estimate, gaps) for f in filters]
+            return tuple(known) if is_known else ()
         frames = self._frames_since(state, filters[0].stamp_ns)
+        if not frames or frames[-1].stamp_ns < now_ns:
+            frames.append(Frame(now_ns, place, []))
         return tuple(
             [
                 f.after(frames, self._noise, self._correlation_s, self._left_out[i])
@@ -233,10 +273,22 @@ class OwnCalibration:
             ]
         )
 
+    def _rough_estimate(self, state: State) -> Estimate | None:
+        """Where a lost robot is if its ranges are hardly known; None if that determines no pose, or
+        if a mistake of its driver explains why it is lost."""
+        recovery = state.memory.recovery
+        if not recovery.lost or recovery.mistake or not self._is_rough_due(state):
+            return None
+        evidence = self._evidence_since(state, state.stamp_ns - WINDOW_NS)
+        return rough_pose(evidence, state.odometry_from_robot, self._field, self._noise)
+
+    def _is_rough_due(self, state: State) -> bool:
+        return state.stamp_ns - state.memory.calibration.rough_ns >= ROUGH_NS
+
     def _frames_since(self, state: State, since_ns: int) -> list[Frame]:
         """The landmarks that were seen after this time, as the sensor read them."""
-        recovery, memory = state.memory.recovery, state.memory.calibration
-        unused = recovery.unused_objects(state.stamp_ns) | {memory.residuals.misplaced}
+        memory = state.memory.calibration
+        unused = {memory.residuals.misplaced}
         present, frames = memory.adaptation, dict[int, Frame]()
         for e in self._evidence_since(state, since_ns):
             stamp_ns, place, name, x, y, range_m, bearing, sigma_m, sigma_rad, _, _, _, _ = e
@@ -311,6 +363,18 @@ class OwnCalibration:
         learned, references, total_turn_rad, _, _, *others = memory
         parts = learned, references, total_turn_rad, check, present, *others
         return with_calibration(state, new(CalibrationMemory, parts))
+
+
+def _at_pose(state: State, estimate: Estimate) -> State:
+    """The state at another pose. Why the robot was lost before, and what of the map it blamed for
+    it, is void."""
+    recovery, updates = state.memory.recovery, state.updates
+    state = state.counted("found_again") if recovery.lost else state
+    recovery = recovery._replace(
+        lost="", kidnapped_ns=-1, suspected_ns=-1, trusted=None, mistake="", misplaced={}
+    )
+    state = state._replace(estimate=estimate, updates=updates._replace(innovations=1))
+    return with_recovery(state, recovery)
 
 
 def _with_adaptation(state: State, changed: Adaptation) -> State:

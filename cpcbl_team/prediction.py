@@ -43,7 +43,8 @@ class Prediction:
             state = self.predict(state, from_ns, odometry)
         if before is not None and before.stamp_ns > state.stamp_ns:
             state = state.counted("odometry_overlap")
-        return with_odometry(state, odometry, max(state.odometry_until_ns, until_ns))
+        state = with_odometry(state, odometry, max(state.odometry_until_ns, until_ns))
+        return self._calibration.after_odometry(state)
 
     def predict(self, state: State, until_ns: int, following: Odometry | None = None) -> State:
         """Step 1: the state at `until_ns`, moved along the known odometry (J C J^T, section 4).

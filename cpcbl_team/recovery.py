@@ -8,6 +8,7 @@ what it measures, it inflates its covariance step by step until its gates open.
 from collections.abc import Callable, Sequence
 from typing import Final
 
+from cpcbl_team.calibration_filter import DETERMINED
 from cpcbl_team.config import Field, LocalizationSettings
 from cpcbl_team.contradictions import contradicts, kept_at_trusted_pose
 from cpcbl_team.estimate import Estimate
@@ -236,12 +237,13 @@ class Recovery:
     ) -> State:
         """The state of a robot that begins anew with an estimate that its former one is not in."""
         _, teammates, calibration, _ = memory = state.memory
-        common = calibration.common
+        common, filters = calibration.common, calibration.filters
         memory = memory._replace(
             recovery=recovery,
             teammates=teammates._replace(senders=senders),
             calibration=calibration._replace(
                 references=None,
+                filters=filters if all(f.used >= DETERMINED for f in filters) else (),
                 check=calibration.check.restarted(state.updates.accepted),
                 rejections=MapRejections(stamp_ns=state.stamp_ns, counted=state.updates.accepted),
                 residuals=NO_RESIDUALS,

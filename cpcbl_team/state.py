@@ -12,7 +12,7 @@ from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from cpcbl_team.arcs import with_arc_width
-from cpcbl_team.calibration_doubt import with_mixture
+from cpcbl_team.calibration_doubt import with_doubt
 from cpcbl_team.calibration_filter import CalibrationFilter
 from cpcbl_team.common_errors import CommonErrors
 from cpcbl_team.config import Field, Start
@@ -179,14 +179,13 @@ class CalibrationMemory(NamedTuple):
     adaptation: Adaptation = AS_CONFIGURED
     rejections: MapRejections = MapRejections()
     filters: tuple[CalibrationFilter, ...] = ()  # of its errors; empty before they begin
-    common: CommonErrors | None = None
-    """What is known of the constant errors of the camera; None without a camera whose errors the
-    filter considers."""
+    common: CommonErrors | None = None  # of a camera whose constant errors the filter considers
     residuals: MapResiduals = MapResiduals()
     unplaced: Mapping[str, tuple[LandmarkReading, ...]] = _NONE
     """What was read of landmarks whose places are not known yet."""
     innovations: Innovations = _NONE  # of landmarks whose places the robot has found itself,
     moved: Moves = _NONE  # and those of them that moved since then
+    rough_ns: int = 0  # when a lost robot last looked for a pose with which `filters` may begin
     stationary: StationaryRecord | None = None  # None while it drives
 
     @property
@@ -238,7 +237,7 @@ class State(NamedTuple):
         """The estimate as it is belief to others: as uncertain as the settings are, too."""
         known = self.memory.calibration
         estimate = with_doubts(with_arc_width(self.estimate), known.check)
-        return with_mixture(estimate, self.odometry_from_robot, known.filters)
+        return with_doubt(estimate, self.odometry_from_robot, known.filters, known.adaptation)
 
     @property
     def common_errors(self) -> CommonErrors | None:

@@ -14,11 +14,17 @@ from support.core import (
     localizer,
     loop,
     matrix2,
+    matrix3,
     sensor_noise,
     state_at,
 )
 
-from cpcbl_team.calibration_doubt import ODDS, with_mixture, with_probabilities
+from cpcbl_team.calibration_doubt import (
+    ODDS,
+    with_mixture,
+    with_probabilities,
+    with_remaining_errors,
+)
 from cpcbl_team.calibration_filter import FILTERS, FIRST_SIGMAS, CalibrationFilter
 from cpcbl_team.config import SensorSettings
 from cpcbl_team.estimate import Covariance3, Estimate
@@ -29,6 +35,7 @@ from cpcbl_team.range_errors import NO_RANGE_ERRORS, RangeErrors
 
 TWO = Sensor(names="ac")  # of which each second filter but one sees both
 HERE = Pose2(0.0, 0.0, 0.0)
+OWN = Estimate(HERE, diagonal(100.0, 100.0))  # no filter contradicts it
 
 
 def density(off: np.ndarray, covariance: np.ndarray) -> float:
@@ -41,6 +48,7 @@ def knowing(errors: np.ndarray, covariance: np.ndarray, pose: Pose2 = HERE) -> C
     """A filter that knows this of the bias of bearings and of both errors of ranges."""
     rows = np.diag([1.0] * 8)
     rows[:3, :3], rows[3:6, 3:6] = 0.01 * np.eye(3), covariance
+    rows[6:, 6:] = 0.005 * np.eye(2)  # as much as before, by the noise of chords
     return CalibrationFilter(
         0, HERE, pose, (*map(float, errors), 0.0, 0.0), tuple(map(tuple, rows))
     )
@@ -56,7 +64,7 @@ def filters_over_time(
             f.after(frames[i : i + 3], NOISE, 0.0, frozenset(names[n::FILTERS]))
             for n, f in enumerate(filters)
         ]
-        found.append(with_probabilities(tuple(filters), AS_CONFIGURED))
+        found.append(with_probabilities(tuple(filters), AS_CONFIGURED, OWN, HERE))
     return found
 
 
@@ -74,7 +82,7 @@ def test_probabilities_are_those_of_bayes() -> None:
     assert by_all > 1.0
     assert by_bias > 1.0
     odds = ODDS * (by_all - 1.0 + by_bias - 1.0)
-    (found,) = with_probabilities((knowing(errors, after),), AS_CONFIGURED)
+    (found,) = with_probabilities((knowing(errors, after),), AS_CONFIGURED, OWN, HERE)
     assert found.probability == pytest.approx(odds / (1.0 + odds))
 
 
@@ -82,14 +90,14 @@ def test_errors_that_are_corrected_are_not_doubted() -> None:
     errors, after = np.array([0.1, 0.08, -0.05]), 1e-4 * np.eye(3)
     corrected = Adaptation(bearing_bias_rad=0.1, ranges=RangeErrors(0.08, -0.05))
     filters = (knowing(errors, after),) * FILTERS
-    assert probability(with_probabilities(filters, AS_CONFIGURED)) == pytest.approx(1.0)
-    assert probability(with_probabilities(filters, corrected)) == 0.0
+    assert probability(with_probabilities(filters, AS_CONFIGURED, OWN, HERE)) == pytest.approx(1.0)
+    assert probability(with_probabilities(filters, corrected, OWN, HERE)) == 0.0
 
 
 def test_rounding_is_no_evidence() -> None:
     """Of errors that one reading ties together nothing is known but their sum."""
     together = 1e-4 * np.ones((3, 3)) - 1e-20 * np.eye(3)
-    (found,) = with_probabilities((knowing(np.zeros(3), together),), AS_CONFIGURED)
+    (found,) = with_probabilities((knowing(np.zeros(3), together),), AS_CONFIGURED, OWN, HERE)
     assert found.probability == 0.0
 
 
@@ -165,3 +173,25 @@ def test_a_robot_with_wrong_ranges_reports_that_it_is_uncertain(scale: float) ->
     assert state.memory.calibration.adaptation.ranges == NO_RANGE_ERRORS
     assert np.mean(reported) < 4.0
     assert np.mean(alone) > 10.0
+
+
+def test_a_pose_that_a_filter_contradicts_is_as_likely_wrong_as_the_settings() -> None:
+    (near, far), known = ((0.5, 1.5), knowing(np.zeros(3), np.diag(np.square(FIRST_SIGMAS[:3]))))
+    for x, expected in ((near, 0.0), (far, 0.5)):
+        own = Estimate(Pose2(x, 0.0, 0.0), diagonal(0.1, 0.1))
+        (found,) = with_probabilities((known,), AS_CONFIGURED, own, HERE)
+        assert found.probability == expected
+
+
+def test_what_is_not_known_of_an_error_that_is_corrected_is_in_the_pose() -> None:
+    frames = drives(Truth(share=0.1), 1, steps=60)
+    known = started().after(frames, NOISE, 0.0)
+    estimate, corrected = Estimate(HERE, diagonal(0.02, 0.02)), Adaptation(ranges=RangeErrors(0.1))
+    rows = np.array(known.covariance)
+    of_errors, with_pose = rows[3:6, 3:6], rows[:3, 3:6]
+    added = known.scatter * with_pose @ np.linalg.inv(of_errors) @ with_pose.T
+    found = with_remaining_errors(estimate, (known,) * FILTERS, corrected).covariance
+    assert matrix3(found) == pytest.approx(matrix3(estimate.covariance) + added)
+    assert np.trace(added[:2, :2]) > 1e-4
+    for filters, settings in (((known,), AS_CONFIGURED), ((), corrected)):
+        assert with_remaining_errors(estimate, filters, settings) is estimate

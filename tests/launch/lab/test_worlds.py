@@ -34,6 +34,8 @@ QUICK = (  # the worlds of the findings, each as short as it may be
     "carried away, 2 landmarks",
     "helper with heading σ 20 deg",
     "landmarks 1 s in 10",
+    "precise ranges 15% too short, 2 landmarks",
+    "precise ranges 15% too short, 4 landmarks",
     "start unknown",
     "uncertain map, 2 landmarks",
     "unsurveyed, 0 of 8 known",

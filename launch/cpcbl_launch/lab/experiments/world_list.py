@@ -229,6 +229,12 @@ def _miscalibrated_worlds() -> dict[str, World]:
     ):
         stated, truth = _alone(field, sensor=narrow), _alone(field, sensor=wrong)
         found[name] = _learning(stated, truth, 2.0 * LEARNING_S)
+    precise = replace(sensor, range_share=0.02, range_floor_m=0.02, bearing_sigma_deg=1.0)
+    for count in (2, 4):
+        field, wrong = _field(count), replace(precise, range_scale=0.85)
+        stated, truth = _alone(field, sensor=precise), _alone(field, sensor=wrong)
+        name = f"precise ranges 15% too short, {_landmarks(count)}"
+        found[name] = _learning(stated, truth, LEARNING_S)
     return found
 
 
