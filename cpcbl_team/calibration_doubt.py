@@ -20,8 +20,15 @@ from cpcbl_team.calibration_filter import (
     Filters,
     Rows,
 )
-from cpcbl_team.estimate import Covariance3, Estimate, dot, outer
-from cpcbl_team.geometry import Pose2, wrap_angle
+from cpcbl_team.estimate import (
+    Covariance3,
+    Estimate,
+    dot,
+    outer,
+    pose_chi_square,
+    pose_difference,
+)
+from cpcbl_team.geometry import Pose2
 from cpcbl_team.miscalibration import Adaptation
 from cpcbl_team.range_errors import NO_RANGE_ERRORS
 
@@ -66,8 +73,7 @@ def with_mixture(estimate: Estimate, place: Pose2, filters: Filters) -> Estimate
     covariance = estimate.covariance.scaled(1.0 - probability)
     for f in filters:
         other = f.estimate_at(place, estimate)
-        x, y = other.pose.x - estimate.pose.x, other.pose.y - estimate.pose.y
-        apart = outer((x, y, wrap_angle(other.pose.heading - estimate.pose.heading)))
+        apart = outer(pose_difference(estimate.pose, other.pose))
         covariance = covariance.plus(other.covariance.plus(apart), f.probability)
     return estimate._replace(covariance=covariance)
 
@@ -108,12 +114,9 @@ def _contradict(filters: Filters, estimate: Estimate, place: Pose2) -> bool:
 
 def _are_apart(one: Estimate, other: Estimate) -> bool:
     """Whether two poses cannot be one and the same."""
-    x, y = one.pose.x - other.pose.x, one.pose.y - other.pose.y
-    apart = x, y, wrap_angle(one.pose.heading - other.pose.heading)
-    covariance = one.covariance.plus(other.covariance)
-    if _is_singular(covariance):
+    if _is_singular(one.covariance.plus(other.covariance)):
         return False
-    return dot(apart, covariance.inverse().times(apart)) > CONTRADICTION
+    return pose_chi_square(one, other) > CONTRADICTION
 
 
 def _ratio(f: CalibrationFilter, present: Adaptation) -> float:

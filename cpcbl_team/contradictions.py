@@ -12,6 +12,7 @@ from typing import Final, NamedTuple
 
 from cpcbl_team.estimate import Estimate, FilteredOffset
 from cpcbl_team.geometry import Pose2
+from cpcbl_team.lost_reasons import no_longer_lost
 from cpcbl_team.relocalization import OUTLIER, PropagatedEvidence, readings_of
 from cpcbl_team.state import Evidence, RecoveryMemory, State
 from cpcbl_team.trusted_pose import LATEST_NS, agrees, expected_pose, explaining_mistake
@@ -146,12 +147,5 @@ def kept_at_trusted_pose(
         if not explains_as_well(known, found, latest, place):
             return None
     until_ns = state.stamp_ns + UNUSED_NS
-    memory = memory._replace(
-        lost="",
-        mistake="",
-        kidnapped_ns=-1,
-        suspected_ns=-1,
-        trusted=None,
-        misplaced={**memory.misplaced, **dict.fromkeys(sorted(misplaced), until_ns)},
-    )
-    return memory, None if is_there else known
+    named = {**memory.misplaced, **dict.fromkeys(sorted(misplaced), until_ns)}
+    return no_longer_lost(memory)._replace(misplaced=named), None if is_there else known

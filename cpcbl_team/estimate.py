@@ -120,6 +120,19 @@ class Estimate(NamedTuple):
         return math.sqrt(self.covariance.hh)
 
 
+def pose_difference(pose: Pose2, other: Pose2) -> Row:
+    """How far `other` is from `pose`: x, y (m) and heading (rad, within [-pi, pi])."""
+    return other.x - pose.x, other.y - pose.y, wrap_angle(other.heading - pose.heading)
+
+
+def pose_chi_square(estimate: Estimate, other: Estimate) -> float:
+    """Of the difference of two independent estimates of one pose; three degrees of freedom. Raises
+    ZeroDivisionError where the sum of their covariances is singular."""
+    difference = pose_difference(estimate.pose, other.pose)
+    information = estimate.covariance.plus(other.covariance).inverse()
+    return dot(difference, information.times(difference))
+
+
 class Scope(Enum):
     """What a merge may move."""
 

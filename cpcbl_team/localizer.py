@@ -113,8 +113,9 @@ class Localizer:
         state = self.predict(state, now)  # 1. differential motion
         state, scope, landmarks, others = self.measure(state, frame)  # 2. measurements
         if scope is None:  # nothing may be updated
-            known = self._calibration.after_rejected(state) if state.lost else state
-            return self.recovery.check(known)
+            if state.lost:
+                state = self._calibration.after_rejected(state)
+            return self.recovery.check(state)
         gated = _NO_OBJECTS
         if others:
             state, gated = self._gate.constrain(state, others, scope)  # 3. constraints

@@ -7,7 +7,7 @@ from typing import NamedTuple
 from cpcbl_team.config import LocalizerSettings
 from cpcbl_team.estimate import Estimate
 from cpcbl_team.relocalization import UNKNOWNS, readings_of
-from cpcbl_team.state import Evidence
+from cpcbl_team.state import Evidence, RecoveryMemory
 
 
 def with_innovations(window: int, accepted: int, rejected: int, length: int) -> int:
@@ -16,6 +16,11 @@ def with_innovations(window: int, accepted: int, rejected: int, length: int) -> 
     window = ((window + 1 << accepted) - 1) << rejected
     full = 1 << length
     return window if window < full else full | window & full - 1
+
+
+def no_longer_lost(memory: RecoveryMemory) -> RecoveryMemory:
+    """The memory without all that is about why and since when the robot may be elsewhere."""
+    return memory._replace(lost="", mistake="", kidnapped_ns=-1, suspected_ns=-1, trusted=None)
 
 
 class Limits(NamedTuple):

@@ -25,6 +25,7 @@ from cpcbl_team.constant_errors import NO_ERRORS, NO_EVIDENCE, pose_offset
 from cpcbl_team.estimate import POSE, Estimate, offset_pose
 from cpcbl_team.geometry import new
 from cpcbl_team.landmarks import Landmarks, LandmarkUpdate
+from cpcbl_team.lost_reasons import no_longer_lost
 from cpcbl_team.map_residuals import ResidualSums
 from cpcbl_team.measurements import GatedObject
 from cpcbl_team.miscalibration import (
@@ -288,11 +289,10 @@ class OwnCalibration:
     def _frames_since(self, state: State, since_ns: int) -> list[Frame]:
         """The landmarks that were seen after this time, as the sensor read them."""
         memory = state.memory.calibration
-        unused = {memory.residuals.misplaced}
         present, frames = memory.adaptation, dict[int, Frame]()
         for e in self._evidence_since(state, since_ns):
             stamp_ns, place, name, x, y, range_m, bearing, sigma_m, sigma_rad, _, _, _, _ = e
-            if name in unused:
+            if name == memory.residuals.misplaced:
                 continue
             if range_m is not None:  # evidence is corrected
                 range_m = (range_m - present.ranges.offset_m) / present.ranges.scale
@@ -370,11 +370,8 @@ def _at_pose(state: State, estimate: Estimate) -> State:
     it, is void."""
     recovery, updates = state.memory.recovery, state.updates
     state = state.counted("found_again") if recovery.lost else state
-    recovery = recovery._replace(
-        lost="", kidnapped_ns=-1, suspected_ns=-1, trusted=None, mistake="", misplaced={}
-    )
     state = state._replace(estimate=estimate, updates=updates._replace(innovations=1))
-    return with_recovery(state, recovery)
+    return with_recovery(state, no_longer_lost(recovery)._replace(misplaced={}))
 
 
 def _with_adaptation(state: State, changed: Adaptation) -> State:

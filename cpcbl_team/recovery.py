@@ -16,7 +16,13 @@ from cpcbl_team.inflation import inflate_covariance, inflate_to
 from cpcbl_team.initial_pose import estimate_of
 from cpcbl_team.inputs import InitialPose
 from cpcbl_team.landmarks import Landmarks
-from cpcbl_team.lost_reasons import Limits, lost_reason, rejected_of, undetermined
+from cpcbl_team.lost_reasons import (
+    Limits,
+    lost_reason,
+    no_longer_lost,
+    rejected_of,
+    undetermined,
+)
 from cpcbl_team.map_rejections import MapRejections
 from cpcbl_team.map_residuals import NO_RESIDUALS
 from cpcbl_team.miscalibration import (
@@ -216,9 +222,7 @@ class Recovery:
 
     def _found(self, state: State, estimate: Estimate, recovery: RecoveryMemory) -> State:
         """The state of a robot that is found again."""
-        recovery = with_jump(state, recovery, estimate.pose)._replace(
-            lost="", kidnapped_ns=-1, suspected_ns=-1
-        )
+        recovery = no_longer_lost(with_jump(state, recovery, estimate.pose))
         senders = reset_scores(state.memory.teammates.senders)
         state = state.counted("found_again")
         return self._begun_anew(state, estimate, recovery, senders)

@@ -9,7 +9,7 @@ import math
 from collections.abc import Callable, Sequence
 from typing import Final
 
-from cpcbl_team.estimate import Covariance3, Estimate
+from cpcbl_team.estimate import Covariance3, Estimate, pose_chi_square
 from cpcbl_team.fusion import chi_square_bound
 from cpcbl_team.geometry import Pose2
 from cpcbl_team.motion import drift_sigmas
@@ -45,11 +45,7 @@ def agrees(estimate: Estimate, found: Estimate, stands: bool = False) -> bool:
     small difference may have other causes than a wrong pose, unless the robot `stands`."""
     if not stands and not are_apart(estimate.pose, found.pose):
         return True
-    information = estimate.covariance.plus(found.covariance).inverse()
-    dx, dy = found.pose.x - estimate.pose.x, found.pose.y - estimate.pose.y
-    turn = math.remainder(found.pose.heading - estimate.pose.heading, math.tau)
-    x, y, heading = information.times((dx, dy, turn))
-    return dx * x + dy * y + turn * heading <= chi_square_bound(UNKNOWNS)
+    return pose_chi_square(estimate, found) <= chi_square_bound(UNKNOWNS)
 
 
 def explaining_mistake(

@@ -222,19 +222,18 @@ def _miscalibrated_worlds() -> dict[str, World]:
         is_odometry = isinstance(part, OdometrySettings)
         truth = _alone(field, **{"odometry" if is_odometry else "sensor": part})
         found[name] = _learning(_alone(field), truth, LEARNING_S)
-    field, narrow = _field(8), replace(sensor, field_of_view_deg=60.0)
-    for name, wrong in (
-        ("bearings 5 deg off, view of 60 deg", replace(narrow, bearing_bias_deg=5.0)),
-        ("ranges a tenth too long, view of 60 deg", replace(narrow, range_scale=1.0 / 1.1)),
-    ):
-        stated, truth = _alone(field, sensor=narrow), _alone(field, sensor=wrong)
-        found[name] = _learning(stated, truth, 2.0 * LEARNING_S)
+    narrow = replace(sensor, field_of_view_deg=60.0)
     precise = replace(sensor, range_share=0.02, range_floor_m=0.02, bearing_sigma_deg=1.0)
-    for count in (2, 4):
-        field, wrong = _field(count), replace(precise, range_scale=0.85)
-        stated, truth = _alone(field, sensor=precise), _alone(field, sensor=wrong)
-        name = f"precise ranges 15% too short, {_landmarks(count)}"
-        found[name] = _learning(stated, truth, LEARNING_S)
+    long, short = 2.0 * LEARNING_S, LEARNING_S
+    for name, count, stated, wrong, learning_s in (
+        ("bearings 5 deg off, view of 60 deg", 8, narrow, {"bearing_bias_deg": 5.0}, long),
+        ("ranges a tenth too long, view of 60 deg", 8, narrow, {"range_scale": 1.0 / 1.1}, long),
+        ("precise ranges 15% too short, 2 landmarks", 2, precise, {"range_scale": 0.85}, short),
+        ("precise ranges 15% too short, 4 landmarks", 4, precise, {"range_scale": 0.85}, short),
+    ):
+        field = _field(count)
+        truth = _alone(field, sensor=replace(stated, **wrong))
+        found[name] = _learning(_alone(field, sensor=stated), truth, learning_s)
     return found
 
 
