@@ -8,6 +8,7 @@ to be corrected, a robot reports the covariance that its pose has by the mixture
 """
 
 import math
+from statistics import fmean
 from typing import Final
 
 from cpcbl_team.calibration_filter import (
@@ -31,6 +32,7 @@ from cpcbl_team.estimate import (
 from cpcbl_team.geometry import Pose2
 from cpcbl_team.miscalibration import Adaptation
 from cpcbl_team.range_errors import NO_RANGE_ERRORS
+from cpcbl_team.scale_errors import ScaleErrors
 
 ODDS: Final = 0.03
 """Of wrong settings to right ones, before anything was seen; for each kind of error."""
@@ -43,17 +45,22 @@ LEAST: Final = 0.2  # odds that are evidence: hardly ever those of a correct rob
 
 
 def with_probabilities(
-    filters: Filters, present: Adaptation, estimate: Estimate, place: Pose2
+    filters: Filters,
+    present: Adaptation,
+    estimate: Estimate,
+    place: Pose2,
+    scales_are_considered: bool = False,
 ) -> tuple[CalibrationFilter, ...]:
     """The filters that know how likely it is that the settings are wrong in the way in which each
     of them says. `present`: what of the settings is corrected already. Where they agree about
     another pose than the robot's own `estimate` (at `place` by odometry), one of both is wrong, and
-    nothing says which: either the settings are, or the robot is elsewhere than it was led."""
+    nothing says which: either the settings are, or the robot is elsewhere than it was led.
+    `scales_are_considered`: wrong scales of the odometry are in the estimate's covariance."""
     share = 1.0 / max(len(filters), 1)
     if _contradict(filters, estimate, place):
         odds = [share for _ in filters]
     else:
-        odds = [share * ODDS * _ratio(f, present) for f in filters]
+        odds = [share * ODDS * _ratio(f, present, scales_are_considered) for f in filters]
     every = sum(odds)
     k = 1.0 / (1.0 + every) if every > LEAST else 0.0
     return tuple([f._replace(probability=k * o) for f, o in zip(filters, odds, strict=True)])
@@ -95,6 +102,18 @@ def with_remaining_errors(estimate: Estimate, filters: Filters, present: Adaptat
     return estimate._replace(covariance=estimate.covariance.plus(added, k))
 
 
+def scale_variances(filters: Filters, first: ScaleErrors) -> tuple[float, float]:
+    """The mean squares of the errors of the distance's and the turn's scale that these filters know
+    of, about the present scales; `first`: as it is without filters."""
+    if not filters:
+        return first.distance, first.turn
+    distance, turn = [
+        fmean([e * e + CHORD_FACTOR * s * s for e, s in [f.error(place) for f in filters]])
+        for place in (DISTANCE, TURN)
+    ]
+    return distance, turn
+
+
 def _sensor_covariance(rows: Rows) -> Covariance3:
     """Of the bias of bearings, and the share and the bias of ranges."""
     bearing, share, offset = [row[BEARING:DISTANCE] for row in rows[BEARING:DISTANCE]]
@@ -119,7 +138,7 @@ def _are_apart(one: Estimate, other: Estimate) -> bool:
     return pose_chi_square(one, other) > CONTRADICTION
 
 
-def _ratio(f: CalibrationFilter, present: Adaptation) -> float:
+def _ratio(f: CalibrationFilter, present: Adaptation, scales_are_considered: bool) -> float:
     """How much likelier the sightings are with a bias of bearings, with that and wrong ranges, or
     with a wrong scale of the odometry, than with the settings as they are; what speaks for these
     does not count."""
@@ -133,7 +152,7 @@ def _ratio(f: CalibrationFilter, present: Adaptation) -> float:
     if min(covariance.xx, covariance.yy, covariance.hh) <= 0.0:
         return 0.0
     ratios = [_single_ratio(errors[0], covariance.xx, first[0])]
-    for place in (DISTANCE, TURN):
+    for place in () if scales_are_considered else (DISTANCE, TURN):
         error, sigma = f.error(place)
         variance = CHORD_FACTOR * sigma * sigma
         ratios.append(_single_ratio(error, variance, first[place - BEARING]))

@@ -19,16 +19,14 @@ errors in it.
 import math
 from collections.abc import Mapping, Sequence
 from math import cos, sin, sqrt
-from statistics import fmean
 from types import MappingProxyType
 from typing import Final, NamedTuple
 
 from cpcbl_team.config import OdometryNoise
 from cpcbl_team.estimate import ZERO3, Covariance3, Estimate, Six
 from cpcbl_team.geometry import Pose2, new, wrap_angle
-from cpcbl_team.miscalibration import LEAST_BIAS_RAD, MOST_BIAS_RAD, Adaptation
 from cpcbl_team.motion import covariance_after, distance_variance, turn_variance
-from cpcbl_team.range_errors import NO_RANGE_ERRORS, RangeErrors
+from cpcbl_team.range_errors import RangeErrors
 from cpcbl_team.sensors import repetition_variance_factor
 
 _atan2: Final = math.atan2  # see `constraints._atan2`
@@ -39,7 +37,7 @@ OFFSET: Final = 5
 DISTANCE: Final = 6
 TURN: Final = 7
 SIZE: Final = 8
-FIRST_SIGMAS: Final = (math.radians(5.0), 0.05, 0.1, 0.1, 0.1)  # rad, 1, m, 1, 1
+FIRST_SIGMAS: Final[tuple[float, ...]] = (math.radians(5.0), 0.05, 0.1, 0.1, 0.1)  # rad, 1, m, 1, 1
 DRIFT: Final = (1e-7, 1e-8, 1e-8, 1e-8, 1e-8)  # variances that a second adds: of a knock
 POSITION_VARIANCE, HEADING_VARIANCE = 0.5**2, math.radians(20.0) ** 2
 """What is added to those of the robot's own pose (m^2, rad^2) where this filter begins."""
@@ -50,22 +48,7 @@ GATE: Final = 16.0  # chi-square of a sighting; 0.03 % of correct ones are beyon
 MOST_REJECTED: Final = 8  # in a row; then the filter begins anew
 FADING: Final = 0.99  # of the sum of the chi-squares, a sighting
 DETERMINED: Final = 4  # sightings have as many readings as it has states
-LEAST_USED: Final = 40  # sightings,
-FEWEST_USED: Final = 12  # if the error is as much clearer
-LEAST_LANDMARKS: Final = 2
-# What an error must be in each filter, in sigmas, before it is corrected
-SIGMAS: Final = 3.0  # a bias of bearings
-CLEAR: Final = 11.8  # both errors of ranges: a chi-square that is as unlikely, with two degrees
-SIGMAS_OF_SCALE: Final = 5.0  # a scale: all filters have the odometry in common
-SIGMAS_AGAIN: Final = 2.0  # a scale that is corrected already
-# How large it must be, as a share; a correction for the first time, and a change of one
-LEAST_SHARE: Final = 0.03  # of a distance or turn
-LEAST_SHARE_OF_RANGE: Final = 0.04  # real sensors follow neither a scale nor a bias exactly
-LEAST_SHARE_AGAIN, LEAST_BIAS_AGAIN_RAD = 0.005, math.radians(0.3)
-MOST_SHARE: Final = 0.3
-ALIKE: Final = 0.5  # by less than this part of it what one filter finds differs from their mean
 LEAST_INDEPENDENT: Final = 1e-9  # of a determinant, as a share of the product of the variances
-SETTLED_RAD: Final = math.radians(1.0)  # sigma of a bias that is known
 
 Rows = tuple[tuple[float, ...], ...]
 _NONE: Final[Mapping[str, int]] = MappingProxyType({})
@@ -111,10 +94,17 @@ class CalibrationFilter(NamedTuple):
     gaps: int = 0  # in the odometry, before the way on which it was led here
 
     @staticmethod
-    def at(stamp_ns: int, place: Pose2, estimate: Estimate, gaps: int = 0) -> "CalibrationFilter":
-        """A filter that knows nothing of the errors. `place`: of the robot by odometry."""
+    def at(
+        stamp_ns: int,
+        place: Pose2,
+        estimate: Estimate,
+        gaps: int = 0,
+        sigmas: Sequence[float] = FIRST_SIGMAS,
+    ) -> "CalibrationFilter":
+        """A filter that knows of the errors their `sigmas` alone. `place`: of the robot by
+        odometry."""
         rows = [[0.0] * SIZE for _ in range(SIZE)]
-        for i, sigma in enumerate(FIRST_SIGMAS):
+        for i, sigma in enumerate(sigmas):
             rows[BEARING + i][BEARING + i] = sigma * sigma
         errors = (0.0,) * len(FIRST_SIGMAS)
         found = CalibrationFilter(stamp_ns, place, estimate.pose, errors, _tuples(rows))
@@ -330,70 +320,6 @@ class _Update:
 
 Filters = Sequence[CalibrationFilter]
 """Of one robot; each leaves out other landmarks."""
-
-
-def correction(filters: Filters, present: Adaptation) -> Adaptation | None:
-    """The settings with the errors that are clear to each filter, and large enough to be worth it;
-    None if that changes nothing. What is corrected already follows what is known."""
-    if any(f.used < FEWEST_USED or len(f.used_ns) < LEAST_LANDMARKS for f in filters):
-        return None
-    # Of few sightings it must be clearer, for what they err by together is hardly known
-    k = max(1.0, LEAST_USED / min([f.used for f in filters]))
-    ranges = _range_errors(filters, present.ranges, k)
-    are_new = present.ranges == NO_RANGE_ERRORS != ranges  # what was found with wrong ones is void
-    bias_rad = _bearing_bias(filters, 0.0 if are_new else present.bearing_bias_rad, k)
-    changed = present._replace(
-        distance_scale=_scale(filters, DISTANCE, present.distance_scale, k),
-        turn_scale=_scale(filters, TURN, present.turn_scale, k),
-        bearing_bias_rad=bias_rad,
-        ranges=ranges,
-    )
-    return None if changed == present else changed
-
-
-def _scale(filters: Filters, place: int, present: float, k: float) -> float:
-    """The scale of distances or turns (`place`: `DISTANCE` or `TURN`), corrected by the error that
-    the filters still find in it."""
-    found = [f.error(place) for f in filters]
-    error, is_first = fmean([e for e, _ in found]), present == 1.0
-    sigmas, least = (
-        (SIGMAS_OF_SCALE, LEAST_SHARE) if is_first else (SIGMAS_AGAIN, LEAST_SHARE_AGAIN)
-    )
-    is_clear = _is_clear(found, error, sigmas * sqrt(k))
-    return present * (1.0 + error) if is_clear and least < abs(error) < MOST_SHARE else present
-
-
-def _is_clear(found: Sequence[tuple[float, float]], mean: float, sigmas: float) -> bool:
-    """Whether all filters are so sure of an error (each with its sigma), and agree about it."""
-    return all(
-        abs(e) > sigmas * sigma and e * mean > 0.0 and abs(e - mean) < ALIKE * abs(mean)
-        for e, sigma in found
-    )
-
-
-def _bearing_bias(filters: Filters, present_rad: float, k: float) -> float:
-    found = [f.error(BEARING) for f in filters]
-    bias_rad = fmean([bias for bias, _ in found])
-    if present_rad == 0.0:
-        is_clear = _is_clear(found, bias_rad, SIGMAS * sqrt(k))
-        return bias_rad if is_clear and LEAST_BIAS_RAD < abs(bias_rad) < MOST_BIAS_RAD else 0.0
-    is_known = all(sigma < SETTLED_RAD for _, sigma in found)
-    is_off = abs(bias_rad - present_rad) > LEAST_BIAS_AGAIN_RAD
-    return bias_rad if is_known and is_off else present_rad
-
-
-def _range_errors(filters: Filters, present: RangeErrors, k: float) -> RangeErrors:
-    found = [f.range_errors for f in filters]
-    errors = RangeErrors(
-        fmean([one.share for one, _ in found]), fmean([one.bias_m for one, _ in found])
-    )
-    share_of_range = filters[0].share_of_range
-    off = share_of_range(errors, present)
-    if present != NO_RANGE_ERRORS:
-        return errors if off > LEAST_SHARE_AGAIN else present
-    is_clear = all(chi_square > k * CLEAR for _, chi_square in found)
-    is_clear &= all(share_of_range(one, errors) < ALIKE * off for one, _ in found)
-    return errors if is_clear and LEAST_SHARE_OF_RANGE < off < MOST_SHARE else present
 
 
 def _tuples(rows: list[list[float]]) -> Rows:

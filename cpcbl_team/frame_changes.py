@@ -10,6 +10,7 @@ bounds them together whatever it is: the covariances of each count twice.
 import math
 from itertools import product
 
+from cpcbl_team.calibration_memory import CalibrationMemory
 from cpcbl_team.common_errors import CommonErrors, inflated
 from cpcbl_team.config import Field, Start
 from cpcbl_team.estimate import Estimate, Row, dot
@@ -17,7 +18,6 @@ from cpcbl_team.inputs import FrameChange
 from cpcbl_team.map_rejections import MapRejections
 from cpcbl_team.parameters import Numbers
 from cpcbl_team.state import (
-    CalibrationMemory,
     State,
     state_at_start,
     with_calibration,
@@ -44,6 +44,7 @@ def begun_in_frame(state: State, start: Start | None, field: Field) -> State:
         filters=calibration.filters,
         common=None if common is None else common.without_objects().uncorrelated(),
         unplaced=calibration.unplaced,
+        scales=calibration.scales.at_new_pose(),
     )
     memory = begun.memory._replace(calibration=own)
     return state._replace(estimate=begun.estimate, updates=begun.updates, memory=memory)

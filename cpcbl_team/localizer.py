@@ -378,4 +378,5 @@ class Localizer:
     def start(self, stamp_ns: int) -> State:
         """The state at the start: at the configured pose, or lost somewhere on the field."""
         state = state_at_start(stamp_ns, self.settings.start, self.field)
+        state = self._calibration.started(state)
         return state if self._common is None else self._common.started(state)

@@ -2,13 +2,27 @@
 
 from cpcbl_team.common_error_filter import CommonErrorFilter
 from cpcbl_team.config import LocalizationSettings
+from cpcbl_team.estimate import Estimate
 from cpcbl_team.geometry import step
 from cpcbl_team.inputs import Odometry
-from cpcbl_team.motion import NO_VARIANCE, bridge, inflate_by_gap, is_gap, part_of_piece
+from cpcbl_team.motion import (
+    NO_VARIANCE,
+    MotionVariance,
+    bridge,
+    inflate_by_gap,
+    is_gap,
+    part_of_piece,
+)
 from cpcbl_team.own_calibration import OwnCalibration
 from cpcbl_team.recovery_evidence import without_evidence
 from cpcbl_team.sensors import time_at_min_speed_s
-from cpcbl_team.state import State, with_motion, with_odometry, with_recovery
+from cpcbl_team.state import (
+    State,
+    with_calibration,
+    with_motion,
+    with_odometry,
+    with_recovery,
+)
 from cpcbl_team.variants import JointVariant
 
 
@@ -69,7 +83,7 @@ class Prediction:
                 state = self._common.before_motion(state, distance, turn, seconds)
             if distance != 0.0 or turn != 0.0:
                 odometry_from_robot = step(odometry_from_robot, distance, turn)
-                estimate = self._variant.move(estimate, distance, turn, crawl_s, extra)
+                state, estimate = self._after_arc(state, distance, turn, crawl_s, extra)
         state = with_motion(state, until_ns, estimate, odometry_from_robot)
         if self._moves and until_ns > state.odometry_until_ns:
             return self._across_gap(state, stamp_ns, following)
@@ -87,10 +101,29 @@ class Prediction:
             if self._common is not None:
                 state = self._common.before_motion(state, distance, turn, 0.0)
             place = step(place, distance, turn)
-            estimate = self._variant.move(estimate, distance, turn, 0.0, extra)
+            state, estimate = self._after_arc(state, distance, turn, 0.0, extra)
         silent_ns = min(gap_ns - self._odometry_timeout_ns, until_ns - from_ns)
         if silent_ns > 0:
             estimate = inflate_by_gap(estimate, silent_ns, before, self._odometry.gap_speed_m_s)
             if before is not None and (before.distance_m or before.turn_rad):
                 state = with_recovery(state, without_evidence(state.memory.recovery))
         return with_motion(state, until_ns, estimate, place)
+
+    def _after_arc(
+        self, state: State, distance: float, turn: float, crawl_s: float, extra: MotionVariance
+    ) -> tuple[State, Estimate]:
+        """The estimate after an arc, and the state that knows what wrong scales of the odometry did
+        to it."""
+        before, memory = state.estimate, state.memory.calibration
+        estimate = self._variant.move(before, distance, turn, crawl_s, extra)
+        scales = memory.scales
+        if not scales.are_considered:
+            return state, estimate
+        if state.lost:
+            scales = scales.at_new_pose()
+        else:
+            scales, added = scales.after_motion(before.pose, before.covariance, distance, turn)
+            covariance = estimate.covariance.plus(added)
+            estimate = self._variant.reduce(estimate._replace(covariance=covariance))
+            scales = scales._replace(covariance=estimate.covariance)
+        return with_calibration(state, memory._replace(scales=scales)), estimate

@@ -251,6 +251,7 @@ class Recovery:
                 check=calibration.check.restarted(state.updates.accepted),
                 rejections=MapRejections(stamp_ns=state.stamp_ns, counted=state.updates.accepted),
                 residuals=NO_RESIDUALS,
+                scales=calibration.scales.at_new_pose(),
                 stationary=None,
                 common=None if common is None else common.uncorrelated(),
             ),

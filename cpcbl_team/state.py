@@ -13,20 +13,14 @@ from typing import Any, NamedTuple
 
 from cpcbl_team.arcs import with_arc_width
 from cpcbl_team.calibration_doubt import with_doubt
-from cpcbl_team.calibration_filter import CalibrationFilter
+from cpcbl_team.calibration_memory import CalibrationMemory
 from cpcbl_team.common_errors import CommonErrors
 from cpcbl_team.config import Field, Start
 from cpcbl_team.estimate import HEADING, POSE, POSITION, ZERO3, Covariance3, Estimate, Scope
 from cpcbl_team.geometry import Pose2, new, wrap_angle
 from cpcbl_team.inputs import Belief, LandmarkBelief, Odometry, Sighting
-from cpcbl_team.landmark_readings import LandmarkReading
-from cpcbl_team.map_rejections import MapRejections
-from cpcbl_team.map_residuals import MapResiduals
-from cpcbl_team.miscalibration import AS_CONFIGURED, Adaptation, ModelCheck, with_doubts
-from cpcbl_team.moved_landmarks import Innovations, Moves
-from cpcbl_team.self_calibration import ReferencePoses, SelfCalibration
+from cpcbl_team.miscalibration import with_doubts
 from cpcbl_team.sender_records import SenderRecord
-from cpcbl_team.stationary_pose import StationaryRecord
 
 FIX = "fix:"  # marks the source of an active fix, apart from a sighting of that teammate
 _NONE: Mapping[str, Any] = MappingProxyType({})
@@ -167,45 +161,6 @@ class TeammateMemory(NamedTuple):
         return {
             n: belief for n, belief in self.landmarks.items() if belief.robot not in in_quarantine
         }
-
-
-class CalibrationMemory(NamedTuple):
-    """What a robot has learned and noticed of its calibration, and what it compares next."""
-
-    learned: SelfCalibration = SelfCalibration()
-    references: ReferencePoses | None = None
-    total_turn_rad: float = 0.0  # of the odometry since the start
-    check: ModelCheck = ModelCheck()
-    adaptation: Adaptation = AS_CONFIGURED
-    rejections: MapRejections = MapRejections()
-    filters: tuple[CalibrationFilter, ...] = ()  # of its errors; empty before they begin
-    common: CommonErrors | None = None  # of a camera whose constant errors the filter considers
-    residuals: MapResiduals = MapResiduals()
-    unplaced: Mapping[str, tuple[LandmarkReading, ...]] = _NONE
-    """What was read of landmarks whose places are not known yet."""
-    innovations: Innovations = _NONE  # of landmarks whose places the robot has found itself,
-    moved: Moves = _NONE  # and those of them that moved since then
-    rough_ns: int = 0  # when a lost robot last looked for a pose with which `filters` may begin
-    stationary: StationaryRecord | None = None  # None while it drives
-
-    @property
-    def corrected(self) -> SelfCalibration:
-        """All that the robot knows of the scales of its odometry and the bias of its bearings."""
-        adapted = self.adaptation
-        return self.learned._replace(
-            distance_scale=self.learned.distance_scale * adapted.distance_scale,
-            turn_scale=self.learned.turn_scale * adapted.turn_scale,
-            bearing_bias_rad=self.bearing_bias_rad,
-        )
-
-    def misplaced(self, stamp_ns: int) -> str:
-        """The object that must stand elsewhere than on the map; empty if there is none."""
-        return self.rejections.misplaced(stamp_ns) or self.residuals.misplaced
-
-    @property
-    def bearing_bias_rad(self) -> float:
-        """What bearings are too large by, as far as the robot knows."""
-        return self.learned.bearing_bias_rad + self.adaptation.bearing_bias_rad
 
 
 class Memory(NamedTuple):
@@ -373,6 +328,13 @@ def with_calibration(state: State, calibration: CalibrationMemory) -> State:
     """The state with this memory of the calibration."""
     recovery, teammates, _, events = state.memory
     return with_memory(state, new(Memory, (recovery, teammates, calibration, events)))
+
+
+def at_new_pose(state: State, estimate: Estimate) -> State:
+    """The state at a pose that does not follow from the one before."""
+    memory = state.memory.calibration
+    state = with_calibration(state, memory._replace(scales=memory.scales.at_new_pose()))
+    return state._replace(estimate=estimate)
 
 
 def with_common_errors(state: State, common: CommonErrors) -> State:

@@ -3,14 +3,15 @@
 from collections.abc import Callable
 from typing import Final
 
+from cpcbl_team.calibration_memory import CalibrationMemory
 from cpcbl_team.config import LocalizationSettings
 from cpcbl_team.estimate import Estimate, Information, InformationSum, Sums
 from cpcbl_team.geometry import new
 from cpcbl_team.measurements import GatedObject, combine
 from cpcbl_team.state import (
-    CalibrationMemory,
     State,
     TrustedPose,
+    at_new_pose,
     with_calibration,
     with_recovery,
 )
@@ -87,7 +88,7 @@ class StationaryCheck:
         record, push = observed(record, stamp_ns, prior, evidence)
         if push is None:
             return _with_record(state, record)
-        state = state.counted(PUSHED)._replace(estimate=self._reduce(push.estimate))
+        state = at_new_pose(state.counted(PUSHED), self._reduce(push.estimate))
         if push.is_of_one_range or push.distance_m > APART_M or push.turn_rad > APART_RAD:
             # It may be anywhere at that range, or too far for what is linear at the former pose
             memory = state.memory.recovery._replace(

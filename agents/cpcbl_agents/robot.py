@@ -23,6 +23,7 @@ from cpcbl_agents.sensing import SensingAgent
 from cpcbl_agents.sources import OwnCamera, Source
 from cpcbl_agents.teammate_frames import TeammateFrames
 from cpcbl_agents.waypoint_follower import WaypointFollower
+from cpcbl_team.calibration_memory import CalibrationMemory
 from cpcbl_team.common_error_filter import considers_camera
 from cpcbl_team.config import Team
 from cpcbl_team.estimate import Estimate
@@ -44,7 +45,7 @@ from cpcbl_team.inputs import (
 )
 from cpcbl_team.landmark_claims import LandmarkClaims
 from cpcbl_team.lost_reasons import rejected_of
-from cpcbl_team.state import CalibrationMemory, Jump, pose_of
+from cpcbl_team.state import Jump, pose_of
 from cpcbl_team.trust import TrustStatus
 from cpcbl_transport.budget import Budget
 from cpcbl_transport.messages import Flow, Help, Message, Outgoing, Pose, SensorInput, Status, Trust

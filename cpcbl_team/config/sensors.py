@@ -11,7 +11,7 @@ from typing import Annotated
 
 import msgspec
 
-from cpcbl_team.config.table import NotNegative, Positive
+from cpcbl_team.config.table import NotNegative, Positive, Share
 
 
 class OdometryNoise(msgspec.Struct, frozen=True, kw_only=True):
@@ -52,6 +52,10 @@ class OdometrySettings(OdometryModel, frozen=True, forbid_unknown_fields=True, k
 
     timeout_s: Positive = 0.5
     """If odometry is missing, the robot is assumed to drive on as before, but for no longer."""
+    distance_scale_sigma: Share = 0.0
+    """The sigma of `distance_scale`, as a share of it: how far it may differ on another day. 0: the
+    robot takes it for exact until it finds that it is wrong."""
+    turn_scale_sigma: Share = 0.0
     gap_speed_m_s: NotNegative = 0.3
     """The sigma that the pose (m, and rad) gains in a second without odometry: with the time while
     the robot is assumed to drive on, then with its root, and there more if it drove fast."""

@@ -14,12 +14,12 @@ from support.nodes import estimate, exchange, helper, only_me, tier, two_robots
 from cpcbl_agents.node import Node, NodeCallbacks, NodeStart
 from cpcbl_agents.robot import build_robot
 from cpcbl_team.arcs import with_arc_width
+from cpcbl_team.calibration_memory import CalibrationMemory
 from cpcbl_team.config import LocalizerSettings
 from cpcbl_team.estimate import ZERO3
 from cpcbl_team.inputs import Sighting
 from cpcbl_team.miscalibration import Adaptation
 from cpcbl_team.self_calibration import SelfCalibration
-from cpcbl_team.state import CalibrationMemory
 from cpcbl_transport import topics
 from cpcbl_transport.compact import BELIEF_BYTES, sent_bytes
 

@@ -10,6 +10,7 @@ from support.buses import MS, SECOND, robot_at, saw, team_of, with_robot
 from cpcbl_agents.agent import Presence, Tick
 from cpcbl_agents.filtering import ODOMETRY_WAIT_NS
 from cpcbl_agents.robot import Robot, build_robot
+from cpcbl_team.calibration_memory import CalibrationMemory
 from cpcbl_team.config import (
     CollaborationSettings,
     MatchSettings,
@@ -24,7 +25,6 @@ from cpcbl_team.geometry import step as stepped
 from cpcbl_team.inputs import Belief, Fix, Odometry, Position, Sighting, Sightings
 from cpcbl_team.miscalibration import Adaptation
 from cpcbl_team.self_calibration import SelfCalibration
-from cpcbl_team.state import CalibrationMemory
 from cpcbl_team.tiers import LOWEST_TIER
 from cpcbl_transport.messages import Message
 

@@ -11,11 +11,11 @@ from support.mistake_rows import ODOMETRY, SEEN, START, Row
 from support.mistakes import bearings
 
 from cpcbl_agents.input_diagnosis.implausible_errors import TEXTS, ImplausibleErrors
+from cpcbl_team.calibration_memory import CalibrationMemory
 from cpcbl_team.constant_errors import Evidence
 from cpcbl_team.estimate import Covariance3
 from cpcbl_team.geometry import Pose2
 from cpcbl_team.miscalibration import AS_CONFIGURED, ModelCheck, Rules, adapted
-from cpcbl_team.state import CalibrationMemory
 
 CORNERS = {"nw": (0.0, 3.0), "ne": (4.0, 3.0), "sw": (0.0, 0.0), "se": (4.0, 0.0)}
 SHUTTLE = World(

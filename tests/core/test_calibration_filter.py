@@ -10,14 +10,13 @@ from support.core import EXACT, SECOND, diagonal
 
 from cpcbl_team.calibration_filter import (
     FILTERS,
-    LEAST_LANDMARKS,
     CalibrationFilter,
     Frame,
     SeenLandmark,
-    correction,
 )
 from cpcbl_team.config import OdometryNoise
 from cpcbl_team.estimate import Estimate
+from cpcbl_team.filter_corrections import LEAST_LANDMARKS, correction
 from cpcbl_team.geometry import Pose2, step
 from cpcbl_team.miscalibration import AS_CONFIGURED, Adaptation
 from cpcbl_team.range_errors import RangeErrors

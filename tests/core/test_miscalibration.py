@@ -24,6 +24,7 @@ from support.core import (
 )
 from support.sweeps import over_seeds
 
+from cpcbl_team.calibration_memory import CalibrationMemory
 from cpcbl_team.config import (
     Field,
     OdometryNoise,
@@ -50,7 +51,7 @@ from cpcbl_team.miscalibration import (
 )
 from cpcbl_team.motion import motion_noise, shortening
 from cpcbl_team.sensors import recalibrated
-from cpcbl_team.state import CalibrationMemory, Memory, State
+from cpcbl_team.state import Memory, State
 
 START = Start(x_m=LOOP_START.x, y_m=LOOP_START.y, sigma_m=0.05, heading_sigma_deg=3.0)
 SENSOR = SensorSettings(range_share=0.05, bearing_sigma_deg=3.0, field_of_view_deg=360.0)

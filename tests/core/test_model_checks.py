@@ -10,6 +10,7 @@ from support.core import (
     state_at,
 )
 
+from cpcbl_team.calibration_memory import CalibrationMemory
 from cpcbl_team.config import (
     OdometryNoise,
 )
@@ -29,7 +30,7 @@ from cpcbl_team.miscalibration import (
     percentages,
     with_doubts,
 )
-from cpcbl_team.state import CalibrationMemory, Memory
+from cpcbl_team.state import Memory
 
 
 def scattered(size: float, alternating: bool) -> ModelCheck:

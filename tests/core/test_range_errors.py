@@ -5,13 +5,14 @@ import pytest
 from msgspec.structs import replace
 from support.core import SECOND, diagonal, frame, localizer, state_at
 
+from cpcbl_team.calibration_memory import CalibrationMemory
 from cpcbl_team.config import SensorSettings, Variant
 from cpcbl_team.geometry import Pose2
 from cpcbl_team.inputs import Sighting, Sightings
 from cpcbl_team.miscalibration import Adaptation, percentages
 from cpcbl_team.range_errors import RangeErrors
 from cpcbl_team.sensors import recalibrated
-from cpcbl_team.state import CalibrationMemory, Memory
+from cpcbl_team.state import Memory
 
 
 @pytest.mark.parametrize(

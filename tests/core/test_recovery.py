@@ -27,6 +27,7 @@ from support.core import (
 )
 from support.evidence import piece
 
+from cpcbl_team.calibration_memory import CalibrationMemory
 from cpcbl_team.config import (
     Field,
     Gives,
@@ -58,7 +59,7 @@ from cpcbl_team.recovery_evidence import (
     with_measurements,
 )
 from cpcbl_team.relocalization import relocalize
-from cpcbl_team.state import CalibrationMemory, Memory, RecoveryMemory, State, Updates
+from cpcbl_team.state import Memory, RecoveryMemory, State, Updates
 
 ORIGIN = Pose2(0.0, 0.0, 0.0)
 HERE = Pose2(-1.0, 0.4, 0.3)

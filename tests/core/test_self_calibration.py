@@ -25,6 +25,7 @@ from support.core import (
     state_at,
 )
 
+from cpcbl_team.calibration_memory import CalibrationMemory
 from cpcbl_team.config import (
     LocalizerSettings,
     OdometryNoise,
@@ -45,7 +46,7 @@ from cpcbl_team.self_calibration import (
     self_calibrate,
 )
 from cpcbl_team.sensors import recalibrated
-from cpcbl_team.state import CalibrationMemory, Memory, RecoveryMemory, State
+from cpcbl_team.state import Memory, RecoveryMemory, State
 
 ORIGIN = Pose2(0.0, 0.0, 0.0)
 NOISE = OdometryNoise()

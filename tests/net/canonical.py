@@ -8,11 +8,12 @@ sides here, and the left sides stay as they are.
 from collections.abc import Iterable
 from typing import Any
 
+from cpcbl_team.calibration_memory import CalibrationMemory
 from cpcbl_team.estimate import Estimate
 from cpcbl_team.inputs import Belief
 from cpcbl_team.localizer import Localizer
 from cpcbl_team.sender_records import SenderRecord
-from cpcbl_team.state import CalibrationMemory, Evidence, State
+from cpcbl_team.state import Evidence, State
 from cpcbl_transport.messages import Track
 
 Canonical = dict[str, Any]

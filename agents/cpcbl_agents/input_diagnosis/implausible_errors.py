@@ -1,7 +1,7 @@
 """Errors of odometry and bearings that are too large for a wrong calibration, as problems."""
 
+from cpcbl_team.calibration_memory import CalibrationMemory
 from cpcbl_team.miscalibration import implausible_now
-from cpcbl_team.state import CalibrationMemory
 
 _IS = "are off by more than any calibration error"
 TEXTS = {

@@ -1,0 +1,230 @@
+"""Scales of odometry that are not known exactly: dead reckoning says how far they may lead it."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from support.core import (
+    CORNERS,
+    PROBABILISTIC,
+    SECOND,
+    Matrix,
+    covariance3,
+    diagonal,
+    displaced,
+    frame,
+    least_eigenvalue,
+    localizer,
+    matrix3,
+    sensor_noise,
+)
+
+from cpcbl_team.config import OdometryNoise, OdometrySettings, SensorSettings, Start, Variant
+from cpcbl_team.constant_errors import INSENSITIVE
+from cpcbl_team.estimate import Estimate
+from cpcbl_team.geometry import Pose2, step
+from cpcbl_team.inputs import InitialPose, Odometry
+from cpcbl_team.localizer import Localizer
+from cpcbl_team.motion import motion_jacobian, motion_noise, move
+from cpcbl_team.scale_errors import EXACT, ScaleErrors
+from cpcbl_team.state import State
+
+NOISE = OdometryNoise()
+SIGMAS = 0.1, 0.2  # of the scales of distances and turns
+PIECE_NS = SECOND // 10
+ARC = 0.05, 0.04  # m and rad of each piece
+START = Start(x_m=0.0, y_m=-1.2, heading_deg=0.0, sigma_m=0.02, heading_sigma_deg=1.0)
+SENSOR = SensorSettings(range_share=0.03, bearing_sigma_deg=2.0, field_of_view_deg=360.0)
+
+
+def moved(
+    estimate: Estimate, scales: ScaleErrors, arc: tuple[float, float]
+) -> tuple[Estimate, ScaleErrors]:
+    """The estimate after an arc, and what the scales have done to it."""
+    after = move(estimate, *arc, NOISE)
+    scales, added = scales.after_motion(estimate.pose, estimate.covariance, *arc)
+    after = after._replace(covariance=after.covariance.plus(added))
+    return after, scales._replace(covariance=after.covariance)
+
+
+def updated(covariance: Matrix, rows: Matrix, noise: float) -> tuple[Matrix, Matrix]:
+    """The covariance after an update by readings (`rows`), and 1 - K H."""
+    gain = covariance @ rows.T @ np.linalg.inv(rows @ covariance @ rows.T + noise * np.eye(2))
+    left = np.eye(3) - gain @ rows
+    return left @ covariance, left
+
+
+def test_covariance_is_that_of_a_filter_that_considers_both_scales() -> None:
+    """Of one with five states, of which only the pose is updated (Schmidt)."""
+    rng = np.random.default_rng(1)
+    scales, pose = ScaleErrors(SIGMAS[0] ** 2, SIGMAS[1] ** 2), Pose2(1.0, 2.0, 0.3)
+    estimate = Estimate(pose, diagonal(0.05, 0.02))
+    reference = np.zeros((5, 5))
+    reference[:3, :3] = matrix3(estimate.covariance)
+    reference[3:, 3:] = np.diag(np.square(SIGMAS))
+    for i in range(80):
+        arc = 0.05, float(rng.uniform(-0.1, 0.1))
+        direction = estimate.pose.heading + 0.5 * arc[1]
+        dx, dy = arc[0] * math.cos(direction), arc[0] * math.sin(direction)
+        whole = np.eye(5)
+        whole[:3, :3] = np.reshape(motion_jacobian(estimate.pose.heading, *arc), (3, 3))
+        whole[:3, 3:] = [[dx, -0.5 * arc[1] * dy], [dy, 0.5 * arc[1] * dx], [0.0, arc[1]]]
+        noise = np.zeros((5, 5))
+        noise[:3, :3] = matrix3(motion_noise(estimate.pose.heading, *arc, NOISE))
+        reference = whole @ reference @ whole.T + noise
+        estimate, scales = moved(estimate, scales, arc)
+        if i % 10 == 9:
+            rows = rng.normal(size=(2, 3))
+            now, left = updated(reference[:3, :3], rows, 0.01)
+            both = np.eye(5)
+            both[:3, :3] = left
+            gain = np.zeros((5, 2))
+            gain[:3] = now @ rows.T / 0.01
+            reference = both @ reference @ both.T + 0.01 * gain @ gain.T
+            estimate = estimate._replace(covariance=covariance3(now))
+        assert matrix3(estimate.covariance) == pytest.approx(reference[:3, :3], abs=1e-12)
+        sensitivity = np.reshape(scales.sensitivity_at(estimate.covariance), (3, 3))[:, :2]
+        due = reference[:3, 3:] @ np.linalg.inv(reference[3:, 3:])
+        assert sensitivity == pytest.approx(due, abs=1e-9)
+
+
+@given(
+    st.lists(
+        st.tuples(st.floats(-0.5, 0.5), st.floats(-1.0, 1.0), st.booleans(), st.floats(0.0, 0.3)),
+        min_size=1,
+        max_size=30,
+    )
+)
+def test_covariance_stays_one_whatever_happens(
+    events: list[tuple[float, float, bool, float]],
+) -> None:
+    """After motions, updates, poses from elsewhere and other variances of the scales."""
+    scales, estimate = ScaleErrors(0.01, 0.04), Estimate(Pose2(0.0, 0.0, 0.0), diagonal(0.1, 0.1))
+    for distance, turn, is_update, sigma in events:
+        estimate, scales = moved(estimate, scales, (distance, turn))
+        if is_update:
+            now, _ = updated(matrix3(estimate.covariance), np.eye(2, 3), 0.01)
+            estimate = estimate._replace(covariance=covariance3(now))
+        elif sigma > 0.2:
+            estimate = estimate._replace(covariance=diagonal(sigma, 0.5 * sigma))
+        variance = sigma * sigma
+        scales, covariance = scales.with_variances(variance, 0.5 * variance, estimate.covariance)
+        estimate = estimate._replace(covariance=covariance)
+        size = float(np.trace(matrix3(covariance)))
+        assert least_eigenvalue(matrix3(covariance)) > -1e-12 * max(size, 1.0)
+
+
+def test_an_error_of_scale_grows_with_the_way_not_with_its_root() -> None:
+    estimate = Estimate(Pose2(0.0, 0.0, 0.0), diagonal(0.0, 0.0))
+    scales = ScaleErrors(0.01, 0.0)
+    for _ in range(100):
+        estimate, scales = moved(estimate, scales, (0.1, 0.0))
+    alone = Estimate(Pose2(0.0, 0.0, 0.0), diagonal(0.0, 0.0))
+    for _ in range(100):
+        alone = move(alone, 0.1, 0.0, NOISE)
+    assert estimate.covariance.xx - alone.covariance.xx == pytest.approx((0.1 * 10.0) ** 2)
+    assert estimate.covariance.yy == pytest.approx(alone.covariance.yy)
+
+
+def test_scales_that_become_less_certain_make_the_pose_less_certain() -> None:
+    scales, estimate = ScaleErrors(0.01, 0.0), Estimate(Pose2(0.0, 0.0, 0.0), diagonal(0.1, 0.1))
+    for _ in range(100):
+        estimate, scales = moved(estimate, scales, (0.1, 0.0))
+    _, more = scales.with_variances(0.04, 0.0, estimate.covariance)
+    assert more.xx - estimate.covariance.xx == pytest.approx(0.03 * 10.0**2)
+    after, same = scales.with_variances(0.0001, 0.0, estimate.covariance)
+    assert same == estimate.covariance
+    assert after.distance == 0.0001
+
+
+def test_exact_scales_are_not_considered() -> None:
+    robot = localizer("joint", start=START, odometry=OdometrySettings())
+    state = robot.add_odometry(robot.start(0), Odometry(0, PIECE_NS, *ARC))
+    state = robot.predict(state, PIECE_NS)
+    assert state.memory.calibration.scales == EXACT
+
+
+def test_a_pose_that_somebody_sets_owes_nothing_to_the_way_to_it() -> None:
+    robot = robot_of()
+    state = driven_blind(robot.start(0), robot, 50)
+    assert state.memory.calibration.scales.are_considered
+    assert state.memory.calibration.scales.sensitivity != INSENSITIVE
+    covariance = 0.01, 0.0, 0.01, 0.0, 0.0, 0.01
+    given = InitialPose(state.stamp_ns, 1.0, 1.0, 0.0, covariance)
+    assert robot.set_pose(state, given).memory.calibration.scales.sensitivity == INSENSITIVE
+
+
+# A robot whose wheels are of another day --------------------------------------------------------
+
+
+class Figures(NamedTuple):
+    nees: float  # of positions; 2 is due
+    inside: float  # share of positions in 3 sigma
+
+
+def robot_of(variant: Variant = "joint", sigmas: tuple[float, float] = SIGMAS) -> Localizer:
+    odometry = OdometrySettings(distance_scale_sigma=sigmas[0], turn_scale_sigma=sigmas[1])
+    return localizer(variant, CORNERS, start=START, sensor=SENSOR, odometry=odometry)
+
+
+def driven_blind(state: State, robot: Localizer, pieces: int) -> State:
+    """After so many arcs in which it sees nothing."""
+    for _ in range(pieces):
+        now = state.stamp_ns
+        state = robot.add_odometry(state, Odometry(now, now + PIECE_NS, *ARC))
+        state = robot.predict(state, now + PIECE_NS)
+    return state
+
+
+def run(robot: Localizer, seed: int, seconds: int = 60) -> tuple[State, Figures]:
+    """A robot whose scales are drawn from their sigmas, that sees landmarks for two seconds in 15:
+    its figures while it does not see any."""
+    rng, state = np.random.default_rng(seed), robot.start(0)
+    by_distance, by_turn = 1.0 + rng.normal(size=2) * SIGMAS
+    pose = displaced(state.estimate.pose, state.estimate.covariance, rng)
+    errors, squares = sensor_noise(rng, SENSOR), []
+    for i in range(10 * seconds):
+        distance, turn = ARC[0] * by_distance, ARC[1] * by_turn
+        noise = motion_noise(pose.heading, distance, turn, NOISE)
+        pose, now = displaced(step(pose, distance, turn), noise, rng), state.stamp_ns
+        state = robot.add_odometry(state, Odometry(now, now + PIECE_NS, *ARC))
+        state = robot.predict(state, now + PIECE_NS)
+        if i % 150 >= 130:
+            state = robot.cycle(state, frame(pose, state.stamp_ns, noise=errors))
+        elif i % 10 == 0:
+            (x, y, _), covariance, _ = state.reported
+            dx, dy = x - pose.x, y - pose.y
+            squares.append(covariance.position().mahalanobis_squared(dx, dy))
+    return state, Figures(float(np.mean(squares)), float(np.mean(np.array(squares) < 11.83)))
+
+
+@pytest.mark.parametrize("variant", PROBABILISTIC)
+def test_sigma_of_dead_reckoning_holds_with_wheels_of_another_day(variant: Variant) -> None:
+    figures = [run(robot_of(variant), seed)[1] for seed in range(12)]
+    assert np.mean([f.nees for f in figures]) < 2.6
+    assert np.mean([f.inside for f in figures]) > 0.975
+
+
+def test_without_it_a_robot_is_sure_of_a_wrong_pose() -> None:
+    figures = [run(robot_of(sigmas=(0.0, 0.0)), seed)[1] for seed in range(4)]
+    assert np.mean([f.nees for f in figures]) > 6.0
+
+
+def test_scales_are_known_after_some_time_among_landmarks() -> None:
+    """Wheels that drive 1.15 of each distance, and turn 0.7 of each turn."""
+    robot, pose, rng = robot_of(), Pose2(0.0, -1.2, 0.0), np.random.default_rng(5)
+    state, errors = robot.start(0), sensor_noise(np.random.default_rng(6), SENSOR)
+    for _ in range(900):
+        distance, turn = 1.15 * ARC[0], 0.7 * ARC[1]
+        noise = motion_noise(pose.heading, distance, turn, NOISE)
+        pose, now = displaced(step(pose, distance, turn), noise, rng), state.stamp_ns
+        state = robot.add_odometry(state, Odometry(now, now + PIECE_NS, *ARC))
+        state = robot.cycle(state, frame(pose, now + PIECE_NS, noise=errors))
+    memory = state.memory.calibration
+    assert memory.adaptation.distance_scale == pytest.approx(1.15, abs=0.05)
+    assert memory.adaptation.turn_scale == pytest.approx(0.7, abs=0.05)
+    assert math.sqrt(memory.scales.distance) < 0.05
+    assert math.sqrt(memory.scales.turn) < 0.05
