@@ -27,6 +27,10 @@ NOISE: Final = {  # what differs, and the noise that grows by it
 }
 SENSOR_UNITS: Final = {"range": 1.0, "bearing": math.degrees(1.0)}
 READINGS = 200  # so many are compared
+ANOTHER_DAY: Final = {"distance_scale_sigma": 0.1, "turn_scale_sigma": 0.2}
+"""How far the scales of wheels, as shares, may differ on a day that no log is of: on another floor,
+with other tyres or batteries. A few days do not tell how far the next one is off. The scales of
+the UTIAS robots hardly differ on three of their days, and by 0.15 and 0.3 on another."""
 
 
 class DayVariance(msgspec.Struct, frozen=True):

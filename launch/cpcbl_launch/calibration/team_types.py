@@ -14,6 +14,7 @@ from tomlkit.toml_document import TOMLDocument
 
 from cpcbl_launch.calibration import odometry, sensor
 from cpcbl_launch.calibration.between_days import (
+    ANOTHER_DAY,
     DayVariance,
     odometry_day_variances,
     pooled_variances,
@@ -216,12 +217,13 @@ def _add_type(document: TOMLDocument, robot: str, found: RobotCalibration) -> No
 
 def _companion_settings(found: RobotCalibration) -> dict[str, dict[str, bool | float]]:
     """Settings that go with calibrated values: the meaning of a range, how often an object is used,
-    and no self-calibration."""
+    how well the scales of the odometry are known, and no self-calibration."""
     parts: dict[str, dict[str, bool | float]] = {}
     if found.sensor:
         parts["sensor"] = {"range_is_depth": found.range_is_depth}
         parts["localizer"] = {"object_interval_s": INTERVAL_S}
     if found.odometry:
+        parts["odometry"] = {**ANOTHER_DAY}
         parts.setdefault("localizer", {})["self_calibration"] = False
     return parts
 

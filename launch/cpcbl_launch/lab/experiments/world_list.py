@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from msgspec.structs import replace
 
+from cpcbl_launch.calibration.between_days import ANOTHER_DAY
 from cpcbl_launch.lab.experiments.runs import with_settings
 from cpcbl_launch.team.file import builtin_path, load_team
 from cpcbl_launch.team.overrides import with_blind_robots
@@ -114,7 +115,7 @@ def worlds() -> dict[str, World]:
     for gives, text in KINDS[1:]:
         team = with_settings(_alone(_field(4, gives)), None, start=wide)
         found[f"wide prior{text}"] = World(team, ("r",))
-    found |= _odometry_worlds() | _unknown_pose_worlds()
+    found |= _odometry_worlds() | _wheel_worlds() | _unknown_pose_worlds()
     found |= _team_worlds() | _miscalibrated_worlds()
     return found | _uncertain_map_worlds() | _unsurveyed_worlds()
 
@@ -138,6 +139,23 @@ def _odometry_worlds() -> dict[str, World]:
         found[name] = World(_alone(_field(count)), ("r",), silent_s=2.0)
     turning = _alone(_field(1), waypoints_m=ZIGZAG, speed_m_s=1.0)
     found["2 s without odometry, fast turns, 1 landmark"] = World(turning, ("r",), silent_s=2.0)
+    return found
+
+
+def _wheel_worlds() -> dict[str, World]:
+    """Robots whose scales of odometry are known as well as those of a robot that was calibrated on
+    another day; `run_world` draws what they really are."""
+    odometry = replace(OdometrySettings(), **ANOTHER_DAY)
+    found: dict[str, World] = {}
+    for count in (1, 2, 4):
+        team = _alone(_field(count), odometry=odometry)
+        found[f"wheels of another day, {_landmarks(count)}"] = World(team, ("r",))
+    team = _alone(_field(4), *_hidden(10.0, 65.0), odometry=odometry)
+    rare = World(team, ("r",), duration_s=65.0)
+    found["wheels of another day, landmarks 1 s in 10"] = rare
+    world = circuit_world("a")
+    team = with_settings(world.team, None, odometry=ANOTHER_DAY)
+    found["wheels of another day, clique, one sees landmarks"] = world._replace(team=team)
     return found
 
 

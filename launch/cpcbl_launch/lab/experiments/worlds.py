@@ -41,6 +41,7 @@ from cpcbl_transport.topics import Qos
 LEAST_INSIDE = 0.98  # of 3 sigma
 POSE_BOUND = 16.27  # of 99.9 %, with three degrees of freedom
 MOST_BEYOND = 1  # found poses; of 60 more are beyond by chance in one table row of 600
+LEAST_SCALE = 0.3  # of wheels that turn at all
 VARIANTS = ("joint", "oval", "circular")
 
 
@@ -113,12 +114,29 @@ def with_true_starts(team: Team, seed: int) -> Team:
     return replace(team, robots=robots)
 
 
+def with_true_wheels(team: Team, seed: int) -> Team:
+    """The team as it is: the scales of each robot's odometry differ from the stated ones by as much
+    as it states that they may."""
+    random, robots = Random(f"wheels {seed}"), dict(team.robots)
+    for name, settings in team.robots.items():
+        wheels = settings.odometry
+        by_distance = random.gauss(0.0, wheels.distance_scale_sigma)
+        by_turn = random.gauss(0.0, wheels.turn_scale_sigma)
+        wheels = replace(
+            wheels,
+            distance_scale=wheels.distance_scale * max(1.0 + by_distance, LEAST_SCALE),
+            turn_scale=wheels.turn_scale * max(1.0 + by_turn, LEAST_SCALE),
+        )
+        robots[name] = replace(settings, odometry=wheels)
+    return replace(team, robots=robots)
+
+
 def run_world(
     world: World, seed: int, watch: Callable[[Bus], object] = lambda bus: None
 ) -> list[WorldRun]:
     """One run of a world: the figures of each scored robot. `watch` may subscribe to it."""
     wrappers = {name: partial(_lossy_bus, world, seed, name) for name in world.team.robots}
-    truth = with_true_starts(world.truth or world.team, seed)
+    truth = with_true_wheels(with_true_starts(world.truth or world.team, seed), seed)
     team, length_s = world.team, world.duration_s
     _, recorder = simulate(team, seed, length_s, truth, watch, bus_wrappers=wrappers)
     true_paths = recorder.simulated_truth()
