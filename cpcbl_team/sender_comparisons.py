@@ -122,6 +122,8 @@ def voting_means(senders: SenderRecords, now_ns: int, name: str, of: int) -> dic
     }
     means = _with_votes(senders, name, means, of)
     silent = _means_of_silent(senders, name, means, now_ns, of)
+    if not silent:
+        return means
     means |= {other: mean for other, mean in silent.items() if other not in silenced}
     return _with_votes(senders, name, means, of)
 

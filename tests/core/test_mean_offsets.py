@@ -19,6 +19,7 @@ from cpcbl_team.mean_offsets import (
     FadingOffsets,
     MeanOffset,
     bias_variance,
+    by_whole_noise,
     both,
     compared_with_majority,
     compared_with_own_sensors,
@@ -42,7 +43,9 @@ def summed(offsets: list[tuple[float, float]], dependent: Covariance2 = NOTHING)
     sums = FadingOffsets()
     for i, offset in enumerate(offsets):
         evidence = Observation(AXES, offset, SHARP, NOTHING).information(SHARP)
-        sums = sums.with_report(i * SECOND // 10, FADING_NS, evidence, dependent)
+        sums = sums.with_report(
+            i * SECOND // 10, FADING_NS, *by_whole_noise(evidence, dependent)
+        )
     return sums
 
 
