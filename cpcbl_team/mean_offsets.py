@@ -133,7 +133,7 @@ def product(a: Covariance2, d: Covariance2) -> Covariance2:
     (xx, xy, yy), (dxx, dxy, dyy) = a, d
     px, py = xx * dxx + xy * dxy, xx * dxy + xy * dyy  # rows of A D
     qx, qy = xy * dxx + yy * dxy, xy * dxy + yy * dyy
-    return Covariance2(px * xx + py * xy, px * xy + py * yy, qx * xy + qy * yy)
+    return new(Covariance2, (px * xx + py * xy, px * xy + py * yy, qx * xy + qy * yy))
 
 
 def by_whole_noise(evidence: Sums, dependent: Covariance2) -> tuple[Sums, Covariance2]:

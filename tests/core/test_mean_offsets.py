@@ -19,8 +19,8 @@ from cpcbl_team.mean_offsets import (
     FadingOffsets,
     MeanOffset,
     bias_variance,
-    by_whole_noise,
     both,
+    by_whole_noise,
     compared_with_majority,
     compared_with_own_sensors,
     disagreement,
@@ -43,9 +43,7 @@ def summed(offsets: list[tuple[float, float]], dependent: Covariance2 = NOTHING)
     sums = FadingOffsets()
     for i, offset in enumerate(offsets):
         evidence = Observation(AXES, offset, SHARP, NOTHING).information(SHARP)
-        sums = sums.with_report(
-            i * SECOND // 10, FADING_NS, *by_whole_noise(evidence, dependent)
-        )
+        sums = sums.with_report(i * SECOND // 10, FADING_NS, *by_whole_noise(evidence, dependent))
     return sums
 
 
