@@ -245,12 +245,12 @@ def contradicts(one: MeanOffset, other: MeanOffset) -> bool:
     return disagreement(one, other) > CONFLICT
 
 
-def bias_variance(one: MeanOffset, other: MeanOffset) -> float:
+def bias_variance(one: MeanOffset, other: MeanOffset, apart: float | None = None) -> float:
     """The square of the bias (m^2) by which the noise of two means does not explain their
     difference d, along the direction w = C^-1 d in which they disagree most: (d w)^2 / w^2, less
     the part 2 / chi-square of it that two degrees of freedom have on average. With the same noise
-    C along both axes this is d^2 less the trace of C."""
-    if disagreement(one, other) <= USUAL:
+    C along both axes this is d^2 less the trace of C. `apart`: their disagreement, if known."""
+    if (disagreement(one, other) if apart is None else apart) <= USUAL:
         return 0.0
     dx, dy, growth = one.x - other.x, one.y - other.y, _growth(one, other)
     (xx, xy, yy) = one.covariance + other.covariance + Covariance2(growth, 0.0, growth)
@@ -327,9 +327,10 @@ def compared_with_majority(mean: MeanOffset, others: Means) -> Comparison:
     if count == 1:
         return Comparison()
     needed = count // 2  # other means that make a strict majority with its own
-    biases = sorted([bias_variance(mean, other) for other in others.values()])
+    apart = {name: disagreement(mean, other) for name, other in others.items()}
+    biases = sorted([bias_variance(mean, other, apart[n]) for n, other in others.items()])
     bias = biases[needed - 1]
-    accusers = {n: o for n, o in others.items() if contradicts(mean, o)}
+    accusers = {n: other for n, other in others.items() if apart[n] > CONFLICT}
     if len(others) - len(accusers) >= needed:
         return Comparison(bias, is_confirmed=True)
     is_wrong = any(2 * (_agreeing(name, accusers) + 1) > count for name in accusers)

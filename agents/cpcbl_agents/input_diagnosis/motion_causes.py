@@ -12,6 +12,7 @@ import math
 from bisect import bisect_left
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from itertools import combinations, pairwise
+from operator import attrgetter
 from statistics import mean, median
 from typing import NamedTuple
 
@@ -64,20 +65,15 @@ class Mistake(NamedTuple):
     turn_total: float = 0.0  # the unit of a heading that stands in the place of a turn
 
 
+_turn, _distance = attrgetter("turn_rad"), attrgetter("distance_m")  # of a step
+
+
 def _seconds(step: Step) -> float:
     return (step.last.stamp_ns - step.last.from_ns) * 1e-9
 
 
-def _turn(step: Step) -> float:
-    return step.turn_rad
-
-
 def _turn_of_rate(step: Step) -> float:
     return step.turn_rad * _seconds(step)
-
-
-def _distance(step: Step) -> float:
-    return step.distance_m
 
 
 def _distance_of_speed(step: Step) -> float:
