@@ -307,12 +307,12 @@ def _motion(
         return f"sightings: {mistakes.MIRRORED}; or the map is mirrored"
     sigma = math.hypot(sensor.range_share, sensor.bearing_sigma_rad)
     tolerance = min(0.15 + 3.0 * sigma, MOST_TOLERANCE)
-    seen = frames, steps, marks, sensor.max_range_m
-    soon = list(motions.resightings(*seen))
+    seen = motions.places_seen(frames, steps, marks, sensor.max_range_m)
+    soon = list(motions.resightings(seen))
     is_right, cause = _shift_of_landmarks(facts, frames, steps)
     cause = cause or motions.motion_cause(soon, steps, motions.errors(soon, steps), tolerance)
     if not cause:
-        late = list(motions.resightings(*seen, *motions.LATER_NS))
+        late = list(motions.resightings(seen, *motions.LATER_NS))
         errors = motions.errors(late, steps)
         cause = motions.motion_cause(late, steps, errors, tolerance)
         is_contradicted = not cause and motions.contradicts(errors, 1.5 * tolerance)
