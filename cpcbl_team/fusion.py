@@ -49,7 +49,9 @@ class Observation(NamedTuple):
 
     def noise(self, dependent_factor: float = 1.0) -> Covariance2:
         """The covariance of the residuals, with the dependent part times `dependent_factor`."""
-        (xx, xy, yy), (dxx, dxy, dyy), k = self.independent, self.dependent, dependent_factor
+        k = dependent_factor
+        xx, xy, yy = self.independent
+        dxx, dxy, dyy = self.dependent
         return new(Covariance2, _noise(xx + k * dxx, xy + k * dxy, yy + k * dyy))
 
     def shifted(self, dx: float, dy: float, turn: float) -> "Observation":

@@ -19,7 +19,8 @@ class Covariance2(NamedTuple):
     yy: float
 
     def __add__(self, other: "Covariance2") -> "Covariance2":  # type: ignore[override]
-        (xx, xy, yy), (oxx, oxy, oyy) = self, other
+        xx, xy, yy = self
+        oxx, oxy, oyy = other
         return new(Covariance2, (xx + oxx, xy + oxy, yy + oyy))
 
     def scaled(self, factor: float) -> "Covariance2":
@@ -44,7 +45,8 @@ class Covariance2(NamedTuple):
 
     def rotated(self, angle: float) -> "Covariance2":
         """The covariance turned by `angle` (rad)."""
-        (xx, xy, yy), c, s = self, math.cos(angle), math.sin(angle)
+        c, s = math.cos(angle), math.sin(angle)
+        xx, xy, yy = self
         turned = (
             c * c * xx - 2.0 * c * s * xy + s * s * yy,
             c * s * (xx - yy) + (c * c - s * s) * xy,
