@@ -245,7 +245,7 @@ def contradicts(one: MeanOffset, other: MeanOffset) -> bool:
     return disagreement(one, other) > CONFLICT
 
 
-def bias_variance(one: MeanOffset, other: MeanOffset, apart: float | None = None) -> float:
+def bias_variance(one: MeanOffset, other: MeanOffset, *, apart: float | None = None) -> float:
     """The square of the bias (m^2) by which the noise of two means does not explain their
     difference d, along the direction w = C^-1 d in which they disagree most: (d w)^2 / w^2, less
     the part 2 / chi-square of it that two degrees of freedom have on average. With the same noise
@@ -328,7 +328,7 @@ def compared_with_majority(mean: MeanOffset, others: Means) -> Comparison:
         return Comparison()
     needed = count // 2  # other means that make a strict majority with its own
     apart = {name: disagreement(mean, other) for name, other in others.items()}
-    biases = sorted([bias_variance(mean, other, apart[n]) for n, other in others.items()])
+    biases = sorted([bias_variance(mean, other, apart=apart[n]) for n, other in others.items()])
     bias = biases[needed - 1]
     accusers = {n: other for n, other in others.items() if apart[n] > CONFLICT}
     if len(others) - len(accusers) >= needed:
