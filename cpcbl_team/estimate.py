@@ -41,7 +41,9 @@ class Covariance3(NamedTuple):
         return new(Covariance3, plus)
 
     def scaled(self, factor: float) -> "Covariance3":
-        return Covariance3(*(factor * a for a in self))
+        xx, xy, yy, xh, yh, hh = self
+        k = factor
+        return new(Covariance3, (k * xx, k * xy, k * yy, k * xh, k * yh, k * hh))
 
     def times(self, h: "Row") -> tuple[float, float, float]:
         """C h."""
@@ -217,12 +219,12 @@ class Information(NamedTuple):
 
     @staticmethod
     def none() -> "Information":
-        return Information(ZERO3, (0.0, 0.0, 0.0))
+        return new(Information, (ZERO3, (0.0, 0.0, 0.0)))
 
     @staticmethod
     def of(sums: Sums) -> "Information":
         matrix, vector = sums
-        return Information(Covariance3(*matrix), vector)
+        return new(Information, (new(Covariance3, matrix), vector))
 
     def add(self, h: Row, residual: float, variance: float) -> "Information":
         """With one more scalar measurement: residual = h . offset + noise of this variance."""
@@ -270,7 +272,7 @@ def symmetric_product(m: Matrix3, p: Covariance3) -> Covariance3:
     """M P where it is known to be symmetric."""
     a, b, c, d, e, f, g, h, i = m
     xx, xy, yy, xh, yh, hh = p
-    return Covariance3(
+    product = (
         a * xx + b * xy + c * xh,
         d * xx + e * xy + f * xh,
         d * xy + e * yy + f * yh,
@@ -278,6 +280,7 @@ def symmetric_product(m: Matrix3, p: Covariance3) -> Covariance3:
         g * xy + h * yy + i * yh,
         g * xh + h * yh + i * hh,
     )
+    return new(Covariance3, product)
 
 
 def within_scope(

@@ -32,6 +32,7 @@ from cpcbl_team.estimate import (
     within_scope,
 )
 from cpcbl_team.gaussian import Covariance2
+from cpcbl_team.geometry import new
 
 
 class Observation(NamedTuple):
@@ -48,8 +49,10 @@ class Observation(NamedTuple):
 
     def noise(self, dependent_factor: float = 1.0) -> Covariance2:
         """The covariance of the residuals, with the dependent part times `dependent_factor`."""
-        i, d, k = self.independent, self.dependent, dependent_factor
-        return Covariance2(*_noise(i.xx + k * d.xx, i.xy + k * d.xy, i.yy + k * d.yy))
+        k = dependent_factor
+        xx, xy, yy = self.independent
+        dxx, dxy, dyy = self.dependent
+        return new(Covariance2, _noise(xx + k * dxx, xy + k * dxy, yy + k * dyy))
 
     def shifted(self, dx: float, dy: float, turn: float) -> "Observation":
         """About an estimate that is so far from the present one (m, rad in the field's frame)."""

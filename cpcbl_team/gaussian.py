@@ -6,6 +6,8 @@ Written for plain floats: on 2 x 2 matrices numpy costs about ten times more.
 import math
 from typing import NamedTuple
 
+from cpcbl_team.geometry import new
+
 MOST_CORRELATION = 1.0 - 1e-6
 
 
@@ -17,13 +19,17 @@ class Covariance2(NamedTuple):
     yy: float
 
     def __add__(self, other: "Covariance2") -> "Covariance2":  # type: ignore[override]
-        return Covariance2(self.xx + other.xx, self.xy + other.xy, self.yy + other.yy)
+        xx, xy, yy = self
+        oxx, oxy, oyy = other
+        return new(Covariance2, (xx + oxx, xy + oxy, yy + oyy))
 
     def scaled(self, factor: float) -> "Covariance2":
-        return Covariance2(factor * self.xx, factor * self.xy, factor * self.yy)
+        xx, xy, yy = self
+        return new(Covariance2, (factor * xx, factor * xy, factor * yy))
 
     def determinant(self) -> float:
-        return self.xx * self.yy - self.xy * self.xy
+        xx, xy, yy = self
+        return xx * yy - xy * xy
 
     def inverse(self) -> "Covariance2":
         """Raises ZeroDivisionError when singular."""
@@ -40,21 +46,23 @@ class Covariance2(NamedTuple):
     def rotated(self, angle: float) -> "Covariance2":
         """The covariance turned by `angle` (rad)."""
         c, s = math.cos(angle), math.sin(angle)
-        return Covariance2(
-            c * c * self.xx - 2.0 * c * s * self.xy + s * s * self.yy,
-            c * s * (self.xx - self.yy) + (c * c - s * s) * self.xy,
-            s * s * self.xx + 2.0 * c * s * self.xy + c * c * self.yy,
+        xx, xy, yy = self
+        turned = (
+            c * c * xx - 2.0 * c * s * xy + s * s * yy,
+            c * s * (xx - yy) + (c * c - s * s) * xy,
+            s * s * xx + 2.0 * c * s * xy + c * c * yy,
         )
+        return new(Covariance2, turned)
 
     def along(self, nx: float, ny: float) -> float:
         """The variance along the unit vector (nx, ny)."""
-        return self.xx * nx * nx + 2.0 * self.xy * nx * ny + self.yy * ny * ny
+        xx, xy, yy = self
+        return xx * nx * nx + 2.0 * xy * nx * ny + yy * ny * ny
 
     def mahalanobis_squared(self, dx: float, dy: float) -> float:
         """d^T C^-1 d. Raises ZeroDivisionError when singular."""
-        return (
-            self.yy * dx * dx - 2.0 * self.xy * dx * dy + self.xx * dy * dy
-        ) / self.determinant()
+        xx, xy, yy = self
+        return (yy * dx * dx - 2.0 * xy * dx * dy + xx * dy * dy) / self.determinant()
 
 
 def oriented_covariance(sigma_major: float, sigma_minor: float, angle: float) -> Covariance2:

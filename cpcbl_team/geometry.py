@@ -36,13 +36,15 @@ class Pose2(NamedTuple):
 
     def transform(self, x: float, y: float) -> tuple[float, float]:
         """The point (x, y) of frame b, in frame a."""
-        c, s = math.cos(self.heading), math.sin(self.heading)
-        return self.x + c * x - s * y, self.y + s * x + c * y
+        own_x, own_y, heading = self
+        c, s = math.cos(heading), math.sin(heading)
+        return own_x + c * x - s * y, own_y + s * x + c * y
 
     def inverse(self) -> "Pose2":
         """`b_from_a`."""
-        c, s = math.cos(self.heading), math.sin(self.heading)
-        return Pose2(-c * self.x - s * self.y, s * self.x - c * self.y, wrap_angle(-self.heading))
+        x, y, heading = self
+        c, s = math.cos(heading), math.sin(heading)
+        return new(Pose2, (-c * x - s * y, s * x - c * y, wrap_angle(-heading)))
 
 
 def step(pose: Pose2, distance: float, turn: float) -> Pose2:

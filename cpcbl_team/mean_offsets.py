@@ -133,7 +133,16 @@ def product(a: Covariance2, d: Covariance2) -> Covariance2:
     (xx, xy, yy), (dxx, dxy, dyy) = a, d
     px, py = xx * dxx + xy * dxy, xx * dxy + xy * dyy  # rows of A D
     qx, qy = xy * dxx + yy * dxy, xy * dxy + yy * dyy
-    return Covariance2(px * xx + py * xy, px * xy + py * yy, qx * xy + qy * yy)
+    return new(Covariance2, (px * xx + py * xy, px * xy + py * yy, qx * xy + qy * yy))
+
+
+def by_whole_noise(evidence: Sums, dependent: Covariance2) -> tuple[Sums, Covariance2]:
+    """The evidence of one report by the whole of its noise, and what it adds to
+    `FadingOffsets.dependent`. `evidence`: by the independent part of its noise; `dependent` (m^2):
+    the other part. A source has weight along the axes along which it is certain, and only there."""
+    if dependent is not NOTHING:
+        evidence = with_position_error(evidence, dependent)
+    return evidence, product(Covariance2(*evidence[0][:3]), dependent)
 
 
 class FadingOffsets(NamedTuple):
@@ -151,23 +160,26 @@ class FadingOffsets(NamedTuple):
     def with_report(
         self, stamp_ns: int, fading_ns: int, evidence: Sums, dependent: Covariance2 = NOTHING
     ) -> "FadingOffsets":
-        """The sums with one more report. A report that is older than the last fades nothing.
-        `evidence`: by the independent part of its noise; `dependent` (m^2): the other part. A
-        source has weight along the axes along which it is certain, and only there."""
+        """The sums with one more report, which `by_whole_noise` gives for the sums of all fading
+        times. A report that is older than the last fades nothing."""
         elapsed_ns = stamp_ns - self.stamp_ns
         fade = math.exp(-elapsed_ns / fading_ns) if elapsed_ns > 0 else 1.0
-        if dependent is not NOTHING:
-            evidence = with_position_error(evidence, dependent)
-        (matrix, vector), (more, further) = self.evidence, evidence
+        (xx, xy, yy, xh, yh, hh), (x, y, h) = self.evidence
+        (axx, axy, ayy, axh, ayh, ahh), (ax, ay, ah) = evidence
+        matrix = (
+            fade * xx + axx,
+            fade * xy + axy,
+            fade * yy + ayy,
+            fade * xh + axh,
+            fade * yh + ayh,
+            fade * hh + ahh,
+        )
         fields = (
             max(stamp_ns, self.stamp_ns),
             fade * self.reports + 1.0,
             fade * fade * self.squares + 1.0,
-            (
-                Covariance3(*(fade * a + b for a, b in zip(matrix, more, strict=True))),
-                tuple(fade * a + b for a, b in zip(vector, further, strict=True)),
-            ),
-            self.dependent.scaled(fade) + product(Covariance2(*more[:3]), dependent),
+            (new(Covariance3, matrix), (fade * x + ax, fade * y + ay, fade * h + ah)),
+            self.dependent.scaled(fade) + dependent,
         )
         return new(FadingOffsets, fields)
 
@@ -221,11 +233,11 @@ Means = Mapping[str, MeanOffset]
 
 def disagreement(one: MeanOffset, other: MeanOffset) -> float:
     """The chi-square of the difference of two means (two degrees of freedom)."""
-    (xx, xy, yy), (oxx, oxy, oyy) = one.covariance, other.covariance
-    common = one.common_m * one.common_m + other.common_m * other.common_m
-    common += _growth(one, other)
-    sum_ = Covariance2(xx + oxx + common, xy + oxy, yy + oyy + common)
-    return sum_.mahalanobis_squared(one.x - other.x, one.y - other.y)
+    x, y, (xx, xy, yy), common_m, _, _ = one
+    ox, oy, (oxx, oxy, oyy), other_m, _, _ = other
+    common = common_m * common_m + other_m * other_m + _growth(one, other)
+    sum_ = new(Covariance2, (xx + oxx + common, xy + oxy, yy + oyy + common))
+    return sum_.mahalanobis_squared(x - ox, y - oy)
 
 
 def contradicts(one: MeanOffset, other: MeanOffset) -> bool:
@@ -233,12 +245,12 @@ def contradicts(one: MeanOffset, other: MeanOffset) -> bool:
     return disagreement(one, other) > CONFLICT
 
 
-def bias_variance(one: MeanOffset, other: MeanOffset) -> float:
+def bias_variance(one: MeanOffset, other: MeanOffset, *, apart: float | None = None) -> float:
     """The square of the bias (m^2) by which the noise of two means does not explain their
     difference d, along the direction w = C^-1 d in which they disagree most: (d w)^2 / w^2, less
     the part 2 / chi-square of it that two degrees of freedom have on average. With the same noise
-    C along both axes this is d^2 less the trace of C."""
-    if disagreement(one, other) <= USUAL:
+    C along both axes this is d^2 less the trace of C. `apart`: their disagreement, if known."""
+    if (disagreement(one, other) if apart is None else apart) <= USUAL:
         return 0.0
     dx, dy, growth = one.x - other.x, one.y - other.y, _growth(one, other)
     (xx, xy, yy) = one.covariance + other.covariance + Covariance2(growth, 0.0, growth)
@@ -315,12 +327,12 @@ def compared_with_majority(mean: MeanOffset, others: Means) -> Comparison:
     if count == 1:
         return Comparison()
     needed = count // 2  # other means that make a strict majority with its own
-    biases = sorted(bias_variance(mean, other) for other in others.values())
+    apart = {name: disagreement(mean, other) for name, other in others.items()}
+    biases = sorted([bias_variance(mean, other, apart=apart[n]) for n, other in others.items()])
     bias = biases[needed - 1]
-    agreeing = sum(not contradicts(mean, other) for other in others.values())
-    if agreeing >= needed:
+    accusers = {n: other for n, other in others.items() if apart[n] > CONFLICT}
+    if len(others) - len(accusers) >= needed:
         return Comparison(bias, is_confirmed=True)
-    accusers = {n: o for n, o in others.items() if contradicts(mean, o)}
     is_wrong = any(2 * (_agreeing(name, accusers) + 1) > count for name in accusers)
     return Comparison(bias, is_wrong, not is_wrong)
 

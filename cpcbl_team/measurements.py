@@ -60,9 +60,9 @@ def nearest_belief(
     beliefs: Iterable[Belief], at_ns: int, settings: config.CollaborationSettings
 ) -> tuple[float, Belief] | None:
     """The belief nearest to a time, and its age then (s); None if all are too old, or too late."""
-    before_s = BELIEF_VALID_BEFORE_NS * 1e-9
-    ages = (((at_ns - b.stamp_ns) * 1e-9, b) for b in beliefs)
-    usable = [(age, b) for age, b in ages if -before_s <= age <= settings.max_age_s]
+    before_s, max_age_s = BELIEF_VALID_BEFORE_NS * 1e-9, settings.max_age_s
+    ages = [((at_ns - b.stamp_ns) * 1e-9, b) for b in beliefs]
+    usable = [aged for aged in ages if -before_s <= aged[0] <= max_age_s]
     return min(usable, key=lambda pair: abs(pair[0])) if usable else None
 
 

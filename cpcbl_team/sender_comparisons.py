@@ -122,6 +122,8 @@ def voting_means(senders: SenderRecords, now_ns: int, name: str, of: int) -> dic
     }
     means = _with_votes(senders, name, means, of)
     silent = _means_of_silent(senders, name, means, now_ns, of)
+    if not silent:
+        return means
     means |= {other: mean for other, mean in silent.items() if other not in silenced}
     return _with_votes(senders, name, means, of)
 
@@ -132,8 +134,8 @@ def _with_votes(
     """The means without those of guests that have no vote on `name`. The one vote of several guests
     is that of the one that agrees most with the robot of the team that they speak of."""
     guests = [other for other in means if senders[other].is_guest]
-    of_team = members(senders, {*means, name} - {OWN_SENSORS})
-    if not guests or not of_team:
+    of_team = members(senders, {*means, name} - {OWN_SENSORS}) if guests else []
+    if not of_team:
         return means
     mean, voting = senders[name].means[of], set[str]()
     if len(of_team) == 1 and not senders[name].is_guest and mean is not None:
@@ -147,9 +149,10 @@ def _means_of_silent(
     """What the silent parties of open contests would say now, by what their rivals say."""
     found: dict[str, MeanOffset] = {}
     for present, mean in {name: senders[name].means[of], **means}.items():
-        if mean is None or _is_silent(senders[present], now_ns):
+        rivals = open_rivals(senders, present)
+        if not rivals or mean is None or _is_silent(senders[present], now_ns):
             continue
-        for rival in open_rivals(senders, present):
+        for rival in rivals:
             if rival.name != name and _is_silent(senders[rival.name], now_ns):
                 moved = mean._replace(x=mean.x + rival.x, y=mean.y + rival.y)
                 found.setdefault(rival.name, moved)
@@ -165,9 +168,12 @@ def _is_silent(record: SenderRecord, now_ns: int) -> bool:
 def open_rivals(senders: SenderRecords, name: str) -> tuple[Rival, ...]:
     """The senders out of quarantine with which this one is in a contest: each contradicts the
     other."""
+    rivals = senders[name].rivals
+    if not rivals:
+        return rivals
     return tuple(
         rival
-        for rival in senders[name].rivals
+        for rival in rivals
         if (other := senders.get(rival.name)) is not None
         and other.reason is None
         and any(name == back.name for back in other.rivals)
@@ -256,11 +262,13 @@ def with_comparison(
     rivals = record.rivals
     if not comparison.is_wrong and record.reason is None:
         known = {rival.name for rival in open_rivals(senders, name)}
-        rivals = tuple(
-            rival
-            for rival in _contradicted(senders, name, now_ns)
-            if comparison.is_contested or rival.name in known
-        )
+        rivals = ()
+        if comparison.is_contested or known:
+            rivals = tuple(
+                rival
+                for rival in _contradicted(senders, name, now_ns)
+                if comparison.is_contested or rival.name in known
+            )
     return replace(
         record,
         bias_variance=comparison.bias_variance,

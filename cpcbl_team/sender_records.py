@@ -27,6 +27,7 @@ from cpcbl_team.mean_offsets import (
     SLOW_NS,
     FadingOffsets,
     MeanOffset,
+    by_whole_noise,
 )
 
 SILENCE_NS: Final = 10_000_000_000  # earlier reports count no longer after this silence
@@ -184,17 +185,16 @@ def without_comparisons(record: SenderRecord) -> SenderRecord:
 
 def with_evidence(record: SenderRecord, stamp_ns: int, report: OffsetEvidence) -> SenderRecord:
     """The record with one more report in its means."""
-    evidence, dependent, heading_variance, variance = report
-    offsets = tuple(
-        sums.with_report(stamp_ns, fading_ns, evidence, dependent)
-        for sums, fading_ns in zip(record.offsets, (FAST_NS, SLOW_NS), strict=True)
-    )
-    fast, slow = offsets
+    evidence, dependent = by_whole_noise(report.evidence, report.dependent)
+    fast, slow = record.offsets
+    fast = fast.with_report(stamp_ns, FAST_NS, evidence, dependent)
+    slow = slow.with_report(stamp_ns, SLOW_NS, evidence, dependent)
+    heading_variance, variance = report.heading_variance, report.position_variance
     means = (
         fast.mean(heading_variance, estimate_variance=variance),
         slow.mean(heading_variance, SLOW_COMMON_M, variance),
     )
-    return replace(record, offsets=offsets, means=means)
+    return replace(record, offsets=(fast, slow), means=means)
 
 
 def _with_nis(

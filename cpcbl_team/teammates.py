@@ -135,10 +135,9 @@ class TeammateScreen:
         m = found.measurement
         if not m.sender:
             return found
-        place = m.position._replace(
-            covariance=self.cautious(state, m.sender, m.position.covariance)
-        )
-        m = replace(m, position=place)
+        covariance = self.cautious(state, m.sender, m.position.covariance)
+        if covariance is not m.position.covariance:
+            m = replace(m, position=m.position._replace(covariance=covariance))
         return found._replace(
             measurement=m, observation=observation_of(state.estimate, m, found.constraints)
         )

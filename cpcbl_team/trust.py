@@ -164,14 +164,13 @@ def _quarantine_by_mean(senders: SenderRecords, name: str, now_ns: int) -> Trust
     right_turn = wrong_turn(senders, name, now_ns)
     if right_turn is not None:
         changed = {**senders, name: quarantined(senders[name], QuarantineReason.HEADING, now_ns)}
-        decision = TrustDecision(changed, False, "quarantined", frozenset((name,)))
-        return decision._replace(estimate_error_rad=abs(right_turn.rad))
+        turned = abs(right_turn.rad)
+        return TrustDecision(changed, False, "quarantined", frozenset((name,)), 0.0, turned)
     mean, means = senders[name].means[FAST], voting_means(senders, now_ns, name, FAST)
     if mean is None or not means:
         return TrustDecision(senders, False)
-    own = means.get(OWN_SENSORS)
     farthest = max(means.values(), key=lambda other: disagreement(mean, other))
-    right = own or farthest
+    right = means.get(OWN_SENSORS, farthest)
     offset = mean.x - right.x, mean.y - right.y
     record = replace(senders[name], mean_offset=offset, offset_variance=0.0)
     changed = {**senders, name: quarantined(record, reason_of(record), now_ns)}
@@ -184,7 +183,8 @@ def _decide_dispute(
     """Decides who is wrong if a sender has contradicted the estimate for long enough. A source
     supports the estimate only if it agreed with it after the dispute began. If none does, no sender
     is blamed: the robot detects by its innovations that it is lost."""
-    recent = senders_with_a_say(senders, name, now_ns)
+    is_dispute = any(r.score > rules.limit for r in senders.values())
+    recent = senders_with_a_say(senders, name, now_ns) if is_dispute else {}
     disputes_ns = [r.dispute_since_ns for r in recent.values() if r.score > rules.limit]
     if not disputes_ns:
         return TrustDecision(senders, True)

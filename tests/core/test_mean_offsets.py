@@ -20,6 +20,7 @@ from cpcbl_team.mean_offsets import (
     MeanOffset,
     bias_variance,
     both,
+    by_whole_noise,
     compared_with_majority,
     compared_with_own_sensors,
     disagreement,
@@ -42,7 +43,7 @@ def summed(offsets: list[tuple[float, float]], dependent: Covariance2 = NOTHING)
     sums = FadingOffsets()
     for i, offset in enumerate(offsets):
         evidence = Observation(AXES, offset, SHARP, NOTHING).information(SHARP)
-        sums = sums.with_report(i * SECOND // 10, FADING_NS, evidence, dependent)
+        sums = sums.with_report(i * SECOND // 10, FADING_NS, *by_whole_noise(evidence, dependent))
     return sums
 
 

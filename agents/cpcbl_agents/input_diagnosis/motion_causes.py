@@ -12,6 +12,7 @@ import math
 from bisect import bisect_left
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from itertools import combinations, pairwise
+from operator import attrgetter
 from statistics import mean, median
 from typing import NamedTuple
 
@@ -22,9 +23,8 @@ from cpcbl_team.geometry import Pose2
 from cpcbl_team.inputs import Odometry, Sighting, Sightings
 
 LEAST_CASES = 5
-MOST = (
-    0.8  # the share of resightings that a mistake must explain, or that show a driver to be right
-)
+MOST = 0.8
+"""The share of resightings that a mistake must explain, or that show a driver to be right."""
 SPACING_NS = 500_000_000  # from one resighting to the next
 SOON_NS = 1_000_000_000, 2_000_000_000  # from sighting to sighting: if they show a motion, or not
 LATER_NS = 4_000_000_000, 4_000_000_000  # a slow motion shows later
@@ -42,6 +42,9 @@ class Step(NamedTuple):
     distance_m: float
     turn_rad: float
     last: Odometry
+
+
+SeenPlace = tuple[str, int, complex, bool]  # name, stamp, place, whether it is only a bearing
 
 
 class Resighting(NamedTuple):
@@ -64,20 +67,15 @@ class Mistake(NamedTuple):
     turn_total: float = 0.0  # the unit of a heading that stands in the place of a turn
 
 
+_turn, _distance = attrgetter("turn_rad"), attrgetter("distance_m")  # of a step
+
+
 def _seconds(step: Step) -> float:
     return (step.last.stamp_ns - step.last.from_ns) * 1e-9
 
 
-def _turn(step: Step) -> float:
-    return step.turn_rad
-
-
 def _turn_of_rate(step: Step) -> float:
     return step.turn_rad * _seconds(step)
-
-
-def _distance(step: Step) -> float:
-    return step.distance_m
 
 
 def _distance_of_speed(step: Step) -> float:
@@ -265,40 +263,42 @@ def _pose_at(
     return a + share * (b - a), h + share * (k - h)
 
 
-def resightings(
+def places_seen(
     frames: Iterable[Sightings],
     steps: Sequence[Step],
     names: Mapping[str, Landmark],
     reach_m: float,
-    least_ns: int = SOON_NS[0],
-    most_ns: int = SOON_NS[1],
-) -> Iterator[Resighting]:
-    """Each landmark and a later sighting of it within the time of the steps: as soon as it shows a
-    motion, or after so long. `reach_m`: how far the sensor sees."""
+) -> list[SeenPlace]:
+    """Each sighting of a landmark in the time of the steps. `reach_m`: how far the sensor sees."""
     if len(steps) < 2:
-        return
+        return []
     # The first step is left out: a total in its last piece has nothing before it
     begin_ns, end_ns = steps[0].stamp_ns, steps[-1].stamp_ns
+    return [
+        (seen.id, frame.stamp_ns, place, seen.range_m is None)
+        for frame in frames
+        if begin_ns <= frame.stamp_ns <= end_ns
+        for seen in frame.sightings
+        if seen.id in names and (place := place_of(seen, reach_m)) is not None
+    ]
+
+
+def resightings(
+    seen: Iterable[SeenPlace], least_ns: int = SOON_NS[0], most_ns: int = SOON_NS[1]
+) -> Iterator[Resighting]:
+    """Each landmark and a later sighting of it: as soon as it shows a motion, or after so long."""
     begun: dict[str, list[tuple[int, complex]]] = {}
-    for frame in frames:
-        stamp_ns = frame.stamp_ns
-        if not begin_ns <= stamp_ns <= end_ns:
-            continue
-        for seen in frame.sightings:
-            if seen.id not in names or (place := place_of(seen, reach_m)) is None:
-                continue
-            waiting = begun.setdefault(seen.id, [])
-            for since_ns, before in waiting[:]:
-                gap_ns = stamp_ns - since_ns
-                if gap_ns < least_ns:
-                    break  # those after it began later
-                if gap_ns >= most_ns or (
-                    abs(place - before) > NOTABLE * max(abs(place), abs(before))
-                ):
-                    yield Resighting(since_ns, stamp_ns, before, place, seen.range_m is None)
-                    waiting.remove((since_ns, before))
-            if not waiting or stamp_ns - waiting[-1][0] >= SPACING_NS:
-                waiting.append((stamp_ns, place))
+    for name, stamp_ns, place, is_ray in seen:
+        waiting, range_m = begun.setdefault(name, []), abs(place)
+        for since_ns, before in waiting[:]:
+            gap_ns = stamp_ns - since_ns
+            if gap_ns < least_ns:
+                break  # those after it began later
+            if gap_ns >= most_ns or abs(place - before) > NOTABLE * max(range_m, abs(before)):
+                yield Resighting(since_ns, stamp_ns, before, place, is_ray)
+                waiting.remove((since_ns, before))
+        if not waiting or stamp_ns - waiting[-1][0] >= SPACING_NS:
+            waiting.append((stamp_ns, place))
 
 
 def place_of(seen: Sighting, far_m: float = 1.0) -> complex | None:

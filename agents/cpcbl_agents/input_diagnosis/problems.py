@@ -38,7 +38,7 @@ LATEST_NS = 600_000_000
 WAIT_S = 7.0  # for what landmarks show
 LARGEST_ANGLE = 7.0
 LEAST_COVERED = 0.8  # of the time, by odometry
-OVERLAP_S = 0.001  # rounded stamps
+OVERLAP_S = 0.001  # beyond rounded stamps: pieces overlap, as those of two drivers do
 
 REASONS = {
     "empty_payload": "payloads are empty",
@@ -152,20 +152,21 @@ def _problems(facts: InputFacts) -> Iterator[str]:
         yield "camera lost: it delivers no frames, and is opened again and again"
     for name, window in facts.windows.items():
         yield from _refusal_problems(name, window, facts)
-    yield from _gaps(facts)
-    if (lasts_s := causes.piece_s(_odometry(facts))) > facts.timeout_s:
+    pieces = _odometry(facts)
+    yield from _gaps(facts, pieces)
+    if (lasts_s := causes.piece_s(pieces)) > facts.timeout_s:
         yield (
             f"odometry: pieces of {lasts_s:.1f} s are longer than odometry.timeout_s; send"
             " them more often"
         )
 
 
-def _gaps(facts: InputFacts) -> Iterator[str]:
+def _gaps(facts: InputFacts, pieces: Sequence[Odometry]) -> Iterator[str]:
     """Pieces of odometry that are missing, where none is refused."""
     window = facts.windows.get("odometry")
     if window is None or is_often_refused(window):
         return
-    if (share := causes.covered_share(_odometry(facts))) < LEAST_COVERED:
+    if (share := causes.covered_share(pieces)) < LEAST_COVERED:
         yield (
             f"odometry covers only {100.0 * share:.0f} % of the time: pieces are lost, or from_ns"
             " is not where the last one ended"
@@ -220,7 +221,7 @@ def _refusal_cause(reason: str, key: str, window: InputWindow, facts: InputFacts
         cause = causes.twice_cause(frames)
     elif reason == "unknown_object":
         cause = _unknown_names(frames, facts)
-    elif reason == "duplicate" and has_overlap(window):
+    elif reason == "duplicate" and causes.overlap_s(_pieces(window)) > OVERLAP_S:
         cause = "pieces come twice, and overlap; are there two drivers?"
     return cause or REASONS.get(reason, reason)
 
@@ -251,11 +252,6 @@ def _unknown_names(frames: Sequence[Sightings], facts: InputFacts) -> str:
     return f"{', '.join(listed)} {verb} no landmark, wall or robot of this team"
 
 
-def has_overlap(window: InputWindow) -> bool:
-    """Whether pieces of odometry overlap, as those of two drivers do."""
-    return causes.overlap_s(_pieces(window)) > OVERLAP_S
-
-
 def _odometry(facts: InputFacts) -> list[Odometry]:
     window = facts.windows.get("odometry")
     return _pieces(window) if window is not None and window.taken else []
@@ -263,8 +259,11 @@ def _odometry(facts: InputFacts) -> list[Odometry]:
 
 def _pieces(window: InputWindow) -> list[Odometry]:
     """Those whose stamps are near: a speed says nothing where stamps have another unit."""
-    near = [m for now_ns, m in window.recent if abs(now_ns - m.stamp_ns) < causes.YEAR_NS]
-    return [m for m in near if isinstance(m, Odometry)]
+    return [
+        m
+        for now_ns, m in window.recent
+        if isinstance(m, Odometry) and abs(now_ns - m.stamp_ns) < causes.YEAR_NS
+    ]
 
 
 def _implausible(facts: InputFacts) -> Iterator[tuple[str, str]]:
@@ -272,7 +271,7 @@ def _implausible(facts: InputFacts) -> Iterator[tuple[str, str]]:
     positions = facts.windows.get("position", InputWindow(0.0)).recent
     pieces = _odometry(facts)
     frames = [usable(frame) for frame in facts.frames]
-    overlap = bool(pieces) and has_overlap(odometry)
+    overlap = causes.overlap_s(pieces) > OVERLAP_S
     if overlap and "duplicate" not in odometry.refused:
         text = "pieces overlap; two drivers, or from_ns is not where the last one ended"
         yield OVERLAP, f"odometry: {text}"
@@ -308,12 +307,12 @@ def _motion(
         return f"sightings: {mistakes.MIRRORED}; or the map is mirrored"
     sigma = math.hypot(sensor.range_share, sensor.bearing_sigma_rad)
     tolerance = min(0.15 + 3.0 * sigma, MOST_TOLERANCE)
-    seen = frames, steps, marks, sensor.max_range_m
-    soon = list(motions.resightings(*seen))
+    seen = motions.places_seen(frames, steps, marks, sensor.max_range_m)
+    soon = list(motions.resightings(seen))
     is_right, cause = _shift_of_landmarks(facts, frames, steps)
     cause = cause or motions.motion_cause(soon, steps, motions.errors(soon, steps), tolerance)
     if not cause:
-        late = list(motions.resightings(*seen, *motions.LATER_NS))
+        late = list(motions.resightings(seen, *motions.LATER_NS))
         errors = motions.errors(late, steps)
         cause = motions.motion_cause(late, steps, errors, tolerance)
         is_contradicted = not cause and motions.contradicts(errors, 1.5 * tolerance)
