@@ -260,6 +260,28 @@ def bias_variance(one: MeanOffset, other: MeanOffset, *, apart: float | None = N
     return excess if excess > 0.0 else 0.0
 
 
+def lead(one: MeanOffset, other: MeanOffset, own: MeanOffset) -> float:
+    """By how much `one` is nearer to the robot's own sensors than `other`: the difference of two
+    chi-squares (one degree of freedom) along the direction w = C^-1 d in which the two disagree
+    most, by the same variance for both. Chi-squares of the whole plane would favour who is vague:
+    the errors of own sensors along an axis of which it says nothing would count only against who
+    is certain there."""
+    dx, dy = one.x - other.x, one.y - other.y
+    common = one.common_m * one.common_m + other.common_m * other.common_m + _growth(one, other)
+    both_ = one.covariance + other.covariance
+    xx, xy, yy = both_ + Covariance2(common, 0.0, common)
+    wx, wy = yy * dx - xy * dy, xx * dy - xy * dx  # times the determinant
+    growth = max(_growth(one, own), _growth(other, own))
+    more = common + own.common_m * own.common_m + growth
+    xx, xy, yy = both_ + own.covariance + Covariance2(more, 0.0, more)
+    variance = wx * wx * xx + 2.0 * wx * wy * xy + wy * wy * yy
+    if variance <= 0.0:  # both are at the same place
+        return 0.0
+    of_one = wx * (one.x - own.x) + wy * (one.y - own.y)
+    of_other = wx * (other.x - own.x) + wy * (other.y - own.y)
+    return (of_other * of_other - of_one * of_one) / variance
+
+
 def _growth(one: MeanOffset, other: MeanOffset) -> float:
     """By how much the variance (m^2) of the estimate grew between the last reports of two sources,
     one of which is silent: so far odometry alone may have changed the estimate's error. Sources
@@ -304,19 +326,18 @@ def compared_with_own_sensors(mean: MeanOffset, own: MeanOffset, others: Means) 
     other sender that is not clearly farther from these. How many others agree with it does not
     matter. A contested sender is left out if a rival is nearer to the own sensors.
     """
-    here = disagreement(mean, own)
-    distances = [(other, disagreement(other, own)) for other in others.values()]
-    rivals = [there for other, there in distances if contradicts(mean, other)]
-    doubters = [other for other, there in distances if there - here <= NEARER]
+    leads = [(other, lead(other, mean, own)) for other in others.values()]
+    rivals = [ahead for other, ahead in leads if contradicts(mean, other)]
+    doubters = [other for other, ahead in leads if ahead >= -NEARER]
     is_sure = own.is_within(SURE_SIGMA_M)
     if is_sure:
         doubters.append(own)
     bias = max((bias_variance(mean, doubter) for doubter in doubters), default=0.0)
-    is_refuted = is_sure and here > CONFLICT
-    if is_refuted or any(here - there > LEAD for there in rivals):
+    is_refuted = is_sure and disagreement(mean, own) > CONFLICT
+    if is_refuted or any(ahead > LEAD for ahead in rivals):
         return Comparison(bias, is_wrong=True)
-    is_contested = any(there - here <= LEAD for there in rivals)
-    is_left_out = any(here - there > NEARER for there in rivals)
+    is_contested = any(ahead >= -LEAD for ahead in rivals)
+    is_left_out = any(ahead > NEARER for ahead in rivals)
     return Comparison(bias, False, is_contested, not is_contested, is_left_out)
 
 

@@ -13,6 +13,7 @@ from cpcbl_team.fusion import Observation
 from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.mean_offsets import (
     CONFLICT,
+    LEAD,
     NOTHING,
     SLOW_NS,
     Comparison,
@@ -24,6 +25,7 @@ from cpcbl_team.mean_offsets import (
     compared_with_majority,
     compared_with_own_sensors,
     disagreement,
+    lead,
     with_heading_error,
     with_position_error,
 )
@@ -244,6 +246,41 @@ def test_without_a_decision_of_own_sensors_even_a_majority_is_as_biased_as_it_is
     assert lying.bias_variance == right.bias_variance == pytest.approx(0.06**2 - 4e-4)
     nearer = compared_with_own_sensors(honest, at(0.0, sigma=0.02), {"a": liar, "b": liar})
     assert nearer.bias_variance == 0.0
+
+
+def one_axis(x: float, y: float = 0.0) -> MeanOffset:
+    """A source that states 8 mm in x and 25 cm in y."""
+    return MeanOffset(x, y, Covariance2(0.008**2, 0.0, 0.25**2))
+
+
+def test_an_error_of_own_sensors_where_a_liar_says_nothing_is_no_point_for_it() -> None:
+    """Figures of the attack `one axis` in seed 2: own landmarks were off by two sigmas in y, where
+    only the correct source is certain. In x they were nearer to the liar, but not clearly."""
+    own = MeanOffset(0.103, -0.176, Covariance2(0.048**2, 0.0, 0.084**2))
+    honest, liar = at(-0.034, -0.013), one_axis(0.075, -0.008)
+    assert disagreement(honest, own) - disagreement(liar, own) > LEAD
+    right = compared_with_own_sensors(honest, own, {"a": liar})
+    assert right.is_contested
+    assert not right.is_wrong
+
+
+def test_own_sensors_convict_one_that_is_certain_along_one_axis_by_that_axis() -> None:
+    own = MeanOffset(0.0, -0.19, Covariance2(0.02**2, 0.0, 0.084**2))
+    honest, liar = at(0.0, 0.0, sigma=0.014), one_axis(0.1)
+    assert compared_with_own_sensors(liar, own, {"a": honest}).is_wrong
+    assert not compared_with_own_sensors(honest, own, {"a": liar}).is_wrong
+
+
+@given(st.floats(-0.5, 0.5), st.floats(-0.5, 0.5), st.floats(-0.5, 0.5))
+def test_a_lead_depends_on_the_axis_of_the_contradiction_only(x: float, y: float, z: float) -> None:
+    one, other = at(x), one_axis(0.1)
+    ahead = lead(one, other, at(0.03, y, sigma=0.04))
+    assert ahead == pytest.approx(-lead(other, one, at(0.03, y, sigma=0.04)))
+    assert ahead == pytest.approx(lead(one, other, at(0.03, z, sigma=0.04)))
+
+
+def test_sources_at_the_same_place_have_no_lead() -> None:
+    assert lead(at(0.1), at(0.1), at(0.0)) == 0.0
 
 
 def test_vague_own_sensors_lower_the_weight_of_nobody_alone() -> None:

@@ -135,3 +135,11 @@ def test_two_liars_are_no_majority_while_a_correct_observer_does_not_see_the_nav
     (row,) = rows_of([EVERY[name, "navigator"]], [401])[1:]
     assert row.worst_ratio < 1.4  # 1.47 and 1.64 before
     assert row.least_inside_3_sigma > 0.97
+
+
+def test_no_correct_observer_is_quarantined_for_what_own_eyes_see_along_another_axis() -> None:
+    """In this seed the landmarks were off by two sigmas in y, where the liars say nothing."""
+    run = run_attack(EVERY["one axis", "navigator"], 2)
+    assert run.false_quarantines == 0
+    assert run.score.nees is not None
+    assert run.score.nees < 2.0  # it was 9.5
