@@ -5,6 +5,7 @@ import math
 from pathlib import Path
 
 import pytest
+from msgspec.structs import replace
 from support.logs import write_log
 from support.processes import command_line
 
@@ -64,8 +65,8 @@ def test_types_are_added_to_the_base_team_file() -> None:
     assert "# kept" in text
     assert "distance_scale = 0.935 # ± 0.011" in text
     r1 = team.robots["r1"]
-    known = {"distance_scale": 0.935, "delay_s": 0.0, "rate_hz": 5.0}
-    assert r1.odometry == OdometrySettings(**known, **ANOTHER_DAY)
+    found = OdometrySettings(distance_scale=0.935, delay_s=0.0, rate_hz=5.0)
+    assert r1.odometry == replace(found, **ANOTHER_DAY)
     assert r1.sensor == SensorSettings(range_share=0.0412, range_floor_m=0.001, max_range_m=5.0)
     assert r1.speed_m_s == 0.3
     assert team.robots["r2"] == before.robots["r2"]
