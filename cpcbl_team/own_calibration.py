@@ -70,7 +70,7 @@ class OwnCalibration:
     def started(self, state: State) -> State:
         """The state at the start: the scales of the odometry are known as the settings have it."""
         scales, memory = self.filters.scales, state.memory.calibration
-        if not scales.are_considered or not (self._is_checked or self._learns):
+        if not scales.are_considered:
             return state
         if self._learns:
             learned = memory.learned._replace(

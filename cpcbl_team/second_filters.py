@@ -30,7 +30,7 @@ from cpcbl_team.miscalibration import AS_CONFIGURED, Adaptation, ModelCheck, err
 from cpcbl_team.range_errors import NO_RANGE_ERRORS
 from cpcbl_team.recovery_evidence import WINDOW_NS
 from cpcbl_team.rough_pose import rough_pose
-from cpcbl_team.scale_errors import ScaleErrors
+from cpcbl_team.scale_errors import EXACT, ScaleErrors
 from cpcbl_team.state import (
     Evidence,
     State,
@@ -57,8 +57,10 @@ class SecondFilters:
             for i in range(FILTERS)
         ]
         distance, turn = odometry.distance_scale_sigma, odometry.turn_scale_sigma
-        self.scales = ScaleErrors(distance * distance, turn * turn)
-        """As the settings have them."""
+        rules = settings.localizer
+        is_of_paper = rules.variant == "weighted" or rules.paper_uncertainty
+        self.scales = EXACT if is_of_paper else ScaleErrors(distance * distance, turn * turn)
+        """As the settings have them; the variants of the paper know of no such errors."""
         *of_sensor, usual_distance, usual_turn = FIRST_SIGMAS
         self._first_sigmas = (*of_sensor, distance or usual_distance, turn or usual_turn)
 
@@ -71,9 +73,8 @@ class SecondFilters:
         if not self.scales.are_considered:
             return state
         memory, estimate = state.memory.calibration, state.estimate
-        learned = memory.learned
         if self._learns:
-            distance, turn = learned.distance_variance, learned.turn_variance
+            distance, turn = memory.learned.distance_variance, memory.learned.turn_variance
         else:
             distance, turn = scale_variances(memory.filters, self.scales)
         scales, covariance = memory.scales.with_variances(distance, turn, estimate.covariance)

@@ -22,11 +22,18 @@ from support.core import (
     sensor_noise,
 )
 
-from cpcbl_team.config import OdometryNoise, OdometrySettings, SensorSettings, Start, Variant
+from cpcbl_team.config import (
+    LocalizerSettings,
+    OdometryNoise,
+    OdometrySettings,
+    SensorSettings,
+    Start,
+    Variant,
+)
 from cpcbl_team.constant_errors import INSENSITIVE
 from cpcbl_team.estimate import Estimate
 from cpcbl_team.geometry import Pose2, step
-from cpcbl_team.inputs import InitialPose, Odometry
+from cpcbl_team.inputs import InitialPose, InputsMended, Odometry
 from cpcbl_team.localizer import Localizer
 from cpcbl_team.motion import motion_jacobian, motion_noise, move
 from cpcbl_team.scale_errors import EXACT, ScaleErrors
@@ -145,6 +152,23 @@ def test_exact_scales_are_not_considered() -> None:
     state = robot.add_odometry(robot.start(0), Odometry(0, PIECE_NS, *ARC))
     state = robot.predict(state, PIECE_NS)
     assert state.memory.calibration.scales == EXACT
+
+
+@pytest.mark.parametrize(
+    "rules",
+    [
+        LocalizerSettings(variant="weighted"),
+        LocalizerSettings(variant="oval", paper_uncertainty=True),
+    ],
+)
+def test_variants_of_the_paper_never_consider_scales(rules: LocalizerSettings) -> None:
+    """Nor after their inputs were wrong for some time."""
+    odometry = OdometrySettings(distance_scale_sigma=0.1, turn_scale_sigma=0.2)
+    robot = localizer(rules=rules, start=START, odometry=odometry)
+    state = driven_blind(robot.start(0), robot, 10)
+    assert state.memory.calibration.scales == EXACT
+    mended = robot.forget_wrong_inputs(state, InputsMended(state.stamp_ns))
+    assert mended.memory.calibration.scales == EXACT
 
 
 def test_a_pose_that_somebody_sets_owes_nothing_to_the_way_to_it() -> None:
