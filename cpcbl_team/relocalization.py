@@ -13,7 +13,8 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 from cpcbl_team.config import Field, OdometryNoise
-from cpcbl_team.constraints import Constraint, bearing_heading, range_circle
+from cpcbl_team.constraints import NEAREST_M, circle
+from cpcbl_team.constraints import heading as heading_of
 from cpcbl_team.estimate import (
     POSE,
     SMALLEST_VARIANCE,
@@ -135,41 +136,52 @@ class PropagatedEvidence:
             return None
         return self.now_from_then.transform(r * math.cos(a), r * math.sin(a))
 
-    def rows(self, pose: Pose2) -> Iterator[tuple[Row, float, float]]:
+    def rows(self, pose: Pose2) -> list[tuple[Row, float, float]]:
         """(row, residual, variance) about the present pose."""
         then = pose @ self.now_from_then
         hx, hy = pose.y - then.y, then.x - pose.x  # d(position then) / d(heading now)
-        for (x, y, a), residual, variance in self.rows_then(then, self.sigma_m, self._sigma_rad):
-            yield (x, y, a + x * hx + y * hy), residual, variance
+        return [
+            ((x, y, a + x * hx + y * hy), residual, variance)
+            for (x, y, a), residual, variance in self._rows_then(
+                then, self.sigma_m, self._sigma_rad
+            )
+        ]
 
-    def rows_without_drift(self, then: Pose2) -> Iterator[tuple[Row, float, float]]:
+    def rows_without_drift(self, then: Pose2) -> list[tuple[Row, float, float]]:
         """(row, residual, variance) about the pose of that time."""
-        return self.rows_then(then, self._teammate_m, self._teammate_rad)
+        return self._rows_then(then, self._teammate_m, self._teammate_rad)
 
-    def rows_then(
+    def _rows_then(
         self, then: Pose2, sigma_m: float, sigma_rad: float
-    ) -> Iterator[tuple[Row, float, float]]:
+    ) -> list[tuple[Row, float, float]]:
         """The same, with these sigmas beside the sensor's."""
         e = self.evidence
         if self.is_fix:
-            variance = _variance(sigma_m**2 + e.range_sigma_m**2)
-            yield (1.0, 0.0, 0.0), e.x - then.x, variance
-            yield (0.0, 1.0, 0.0), e.y - then.y, variance
-            if e.heading_rad is not None:
-                off = math.remainder(e.heading_rad - then.heading, math.tau)
-                yield (0.0, 0.0, 1.0), off, _variance(sigma_rad**2 + e.bearing_sigma_rad**2)
-            return
-        constraints: list[Constraint | None] = []
+            return _rows_of_fix(e, then, sigma_m, sigma_rad)
+        dx, dy = e.x - then.x, e.y - then.y
+        distance = math.hypot(dx, dy)
+        if distance < NEAREST_M:
+            return []
+        rows = []
         if e.range_m is not None:
-            constraints.append(range_circle(then, e.x, e.y, e.range_m, e.range_sigma_m))
+            u, v, residual = circle(dx, dy, distance, e.range_m)
+            rows.append(((u, v, 0.0), residual, _variance(e.range_sigma_m**2 + sigma_m**2)))
         if e.bearing_rad is not None:
-            constraints.append(bearing_heading(then, e.x, e.y, e.bearing_rad, e.bearing_sigma_rad))
-        for c in constraints:
-            if c is not None:
-                spread = sigma_m
-                if c.on_heading:
-                    spread = math.hypot(sigma_m / c.distance_m, sigma_rad)
-                yield c.row, c.residual, _variance(c.sigma**2 + spread**2)
+            u, v, residual = heading_of(dx, dy, distance**2, e.bearing_rad, then.heading)
+            spread = math.hypot(sigma_m / distance, sigma_rad)
+            rows.append(((u, v, 1.0), residual, _variance(e.bearing_sigma_rad**2 + spread**2)))
+        return rows
+
+
+def _rows_of_fix(
+    e: Evidence, then: Pose2, sigma_m: float, sigma_rad: float
+) -> list[tuple[Row, float, float]]:
+    variance = _variance(sigma_m**2 + e.range_sigma_m**2)
+    rows = [((1.0, 0.0, 0.0), e.x - then.x, variance), ((0.0, 1.0, 0.0), e.y - then.y, variance)]
+    if e.heading_rad is not None:
+        off = math.remainder(e.heading_rad - then.heading, math.tau)
+        rows.append(((0.0, 0.0, 1.0), off, _variance(sigma_rad**2 + e.bearing_sigma_rad**2)))
+    return rows
 
 
 def _variance(variance: float) -> float:
