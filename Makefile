@@ -8,7 +8,7 @@ COMPILED = build/compiled
 # Where it is set, each process that the tests start compiles whatever it imports once more.
 export PYTHONDONTWRITEBYTECODE =
 
-.PHONY: setup demo test quick check unit test-long test-recordings test-ros2 test-trial test-compiled test-docker test-bench \
+.PHONY: setup demo test quick check unit test-thorough test-long test-recordings test-ros2 test-trial test-compiled test-docker test-bench \
   chaos net recording fuzz luck compiled bench bench-degraded bench-detection bench-latency bench-pictures \
   bench-processes bench-scaling bench-view bench-pairs bench-mapping screenshot clean
 
@@ -24,7 +24,9 @@ $(VENV)/ready: pyproject.toml
 demo: setup
 	$(BIN)/cpcbl-team up --view
 
-test: check unit
+# Side by side: mypy has one thread.
+test: setup
+	$(MAKE) --no-print-directory -j 2 check unit
 
 # The core and what runs in memory: no process, no Zenoh session, no camera, no experiment; and not the
 # table of drivers' mistakes, for whoever changes agents/cpcbl_agents/input_diagnosis.
@@ -44,7 +46,11 @@ check: setup
 unit: setup
 	$(BIN)/pytest -n 4 --dist worksteal -m "$(USUAL)"
 
-USUAL = not long and not log and not pictures and not docker and not trial and not ros2 and not recordings
+# More worlds, seeds, images and attacks than `make test` samples, with the same bounds.
+test-thorough: setup
+	$(BIN)/pytest -n 3 --dist worksteal -m thorough
+
+USUAL = not thorough and not long and not log and not pictures and not docker and not trial and not ros2 and not recordings
 
 # Minutes long; with CPCBL_MRCLAM=folder also on real logs, with CPCBL_PICTURES=folder real pictures.
 test-long: setup

@@ -6,7 +6,8 @@ start.
 
 import itertools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
 
 import pytest
 from support.buses import SECOND
@@ -127,9 +128,18 @@ def is_jump(problems: tuple[str, ...]) -> bool:
     return len(problems) == 1 and JUMPED in problems[0]
 
 
-@pytest.mark.parametrize("row", ROWS.values(), ids=list(ROWS))
-def test_one_line_names_the_cause_soon_and_stays(row: Row) -> None:
-    for world in row.worlds:
+def first_and_other_worlds() -> Iterator[Any]:
+    """Each mistake in the first of its worlds; in the others in `make test-thorough`."""
+    for name, row in ROWS.items():
+        yield pytest.param(row, row.worlds[:1], id=name)
+        if row.worlds[1:]:
+            others = f"{name}, other worlds"
+            yield pytest.param(row, row.worlds[1:], id=others, marks=pytest.mark.thorough)
+
+
+@pytest.mark.parametrize(("row", "worlds"), first_and_other_worlds())
+def test_one_line_names_the_cause_soon_and_stays(row: Row, worlds: Sequence[World]) -> None:
+    for world in worlds:
         robot = DrivenRobot(world)
         robot.run(row.within_s + 3.0, row.make())
         named = (i for i, s in enumerate(robot.statuses) if s.problems and not is_jump(s.problems))

@@ -40,9 +40,9 @@ def beyond_3_sigma_m(robot: DrivenRobot) -> float:
     ("world", "y_m", "after_s", "seed", "is_second"),
     [
         (TO_AND_FRO, 2.25, 0.0, 100, True),
-        (TO_AND_FRO, 2.25, 4.41, 109, True),
-        (TO_AND_FRO, 1.5, 1.47, 103, True),
-        (NOISY, 0.75, 0.98, 102, False),
+        pytest.param(TO_AND_FRO, 2.25, 4.41, 109, True, marks=pytest.mark.thorough),
+        pytest.param(TO_AND_FRO, 1.5, 1.47, 103, True, marks=pytest.mark.thorough),
+        pytest.param(NOISY, 0.75, 0.98, 102, False, marks=pytest.mark.thorough),
         (NOISY, 2.25, 0.49, 101, False),
     ],
 )

@@ -97,7 +97,14 @@ def spent(bytes_per_s: float, seconds: int, at_once: int = 1) -> Spent:
 
 
 @pytest.mark.parametrize("at_once", [1, 10], ids=["steady", "stuttering"])
-@pytest.mark.parametrize(("bytes_per_s", "seconds"), [(50, 120), (200, 60), (1000, 30)])
+@pytest.mark.parametrize(
+    ("bytes_per_s", "seconds"),
+    [
+        pytest.param(50, 120, marks=pytest.mark.thorough),
+        (200, 60),
+        pytest.param(1000, 30, marks=pytest.mark.thorough),
+    ],
+)
 def test_a_budget_holds_over_any_ten_seconds_on_the_link(
     bytes_per_s: int, seconds: int, at_once: int
 ) -> None:

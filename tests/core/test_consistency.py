@@ -139,7 +139,7 @@ def test_landmarks_give_the_error_that_is_claimed(
 
 
 def of_a_standing_robot(correlation_s: float, seed: int) -> float:
-    """NEES of the pose after 30 s at 5 Hz; sighting errors are Gauss-Markov, fading in 2 s."""
+    """NEES of the pose after 12 s at 5 Hz; sighting errors are Gauss-Markov, fading in 2 s."""
     sensor = SensorSettings(range_share=0.0, range_floor_m=0.05, correlation_s=correlation_s)
     prior = Start(x_m=0.5, y_m=-0.3, heading_deg=20.0, sigma_m=0.5, heading_sigma_deg=10.0)
     still = OdometrySettings(moves=False)
@@ -155,7 +155,7 @@ def of_a_standing_robot(correlation_s: float, seed: int) -> float:
         a, b = errors[names.index(exact.id)] * (0.05, sensor.bearing_sigma_rad)
         return Sighting(exact.id, exact.range_m + a, wrap_angle(exact.bearing_rad + b))
 
-    for i in range(150):
+    for i in range(60):
         state = robot.cycle(state, frame(truth, (i + 1) * SECOND // 5, noise=noisy))
         errors = rho * errors + math.sqrt(1.0 - rho * rho) * rng.normal(size=errors.shape)
     x, y, heading = state.estimate.pose

@@ -1,12 +1,30 @@
 """Starting a benchmark as its target of make does."""
 
+import io
 import os
 import subprocess
 import sys
+from collections.abc import Callable
+from contextlib import redirect_stderr
 from pathlib import Path
+
+import pytest
 
 TOP = Path(__file__).parents[2]
 FOLDERS = (".", "agents", "transport", "launch", "tests")
+
+
+def refusal_of(main: Callable[[], None], *arguments: object) -> str:
+    """What a benchmark's `main` says of arguments that it refuses, in this process."""
+    errors, words = io.StringIO(), sys.argv
+    sys.argv = ["bench", *map(str, arguments)]
+    try:
+        with redirect_stderr(errors), pytest.raises(SystemExit) as end:
+            main()
+    finally:
+        sys.argv = words
+    assert end.value.code == 2
+    return errors.getvalue()
 
 
 def run_benchmark(name: str, *arguments: object) -> "subprocess.CompletedProcess[str]":

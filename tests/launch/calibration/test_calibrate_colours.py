@@ -7,7 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from support.processes import command_line, cpcbl_team
+from support.processes import command_line
 
 from cpcbl_agents.vision.camera import Pixels
 from cpcbl_launch.calibration.colour_samples import (
@@ -325,7 +325,7 @@ def test_the_command_line_writes_a_team_that_it_can_check(folder: Path, tmp_path
     team.write_text(TEAM)
     rows = [s for i in range(3) for s in boxes(PAINT, folder / f"{i}.png")]
     file.write_text("".join(f"{s.picture},{s.colour},{','.join(map(str, s.at))}\n" for s in rows))
-    ran = cpcbl_team(*("calibrate", "colours", team, "--samples", file, "--preview", drawing))
+    ran = command_line(*("calibrate", "colours", team, "--samples", file, "--preview", drawing))
     assert ran.returncode == 0, ran.stderr
     assert max(len(line) for line in ran.stdout.splitlines()[:-1]) <= 80
     for word in ("thresholds, 8-bit HSV", "orange", "elsewhere", f"written: {team}"):

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 from msgspec.structs import replace
-from support.processes import command_line, cpcbl_team
+from support.processes import command_line
 
 from cpcbl_agents.sources.mrclam import LogError
 from cpcbl_agents.vision.camera import Camera
@@ -366,7 +366,7 @@ def test_the_command_line_writes_a_team_that_it_can_check(wrong: Path, tmp_path:
     team = tmp_path / "lab.toml"
     team.write_text(TEAM)
     options = [team, "--pictures", wrong, "--poses", wrong / "poses.csv", "--type", "eye"]
-    ran = cpcbl_team("calibrate", "sensor", *options)
+    ran = command_line("calibrate", "sensor", *options)
     assert ran.returncode == 0, ran.stderr
     assert max(len(line) for line in ran.stdout.splitlines()[:-1]) <= 80
     for word in ("landmarks", "teammates", "in 3 σ", "bearing_bias_deg", f"written: {team}"):

@@ -6,7 +6,7 @@ from pathlib import Path
 import msgspec
 import pytest
 from support.calibration_team import MAP, SECONDS, STANDING, TEAM
-from support.processes import command_line, cpcbl_team
+from support.processes import command_line
 from support.simulated import simulate_recorded
 
 from cpcbl_launch.calibration.logs import read_log, read_logs
@@ -112,7 +112,7 @@ def test_calibrate_prints_writes_and_draws(tmp_path: Path) -> None:
     type_text, picture = tmp_path / "calibrated.toml", tmp_path / "residuals.png"
     path = tmp_path / "trio.mcap"
     simulate_recorded(TEAM, 1, 30.0, path)
-    ran = cpcbl_team("calibrate", path, "--output", type_text, "--picture", picture)
+    ran = command_line("calibrate", path, "--output", type_text, "--picture", picture)
     assert ran.returncode == 0, ran.stderr
     assert max(len(line) for line in ran.stdout.splitlines()[:-1]) <= 80  # last: a path
     for word in ("loss m/rad", "bias deg", "±", "does not drive", str(type_text.name)):

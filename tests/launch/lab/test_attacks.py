@@ -45,12 +45,14 @@ def short(runs: Short) -> dict[tuple[str, str], AttackRow]:
     return runs.rows
 
 
+@pytest.mark.thorough
 def test_nothing_is_used_of_a_liar_that_is_in_quarantine(runs: Short) -> None:
     """Its weight is so small by then that the figures hardly tell."""
     assert runs.quarantines.heard == {*attacks.TWO}
     assert runs.quarantines.used == set()
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("key", SHORT[:2])
 def test_an_attack_is_noticed_and_does_little_harm(
     short: dict[tuple[str, str], AttackRow], key: tuple[str, str]
@@ -66,6 +68,7 @@ def test_an_attack_is_noticed_and_does_little_harm(
     assert row.false_quarantines == 0
 
 
+@pytest.mark.thorough
 def test_without_a_majority_the_robot_says_so_and_its_sigma_holds(
     short: dict[tuple[str, str], AttackRow],
 ) -> None:
@@ -75,6 +78,7 @@ def test_without_a_majority_the_robot_says_so_and_its_sigma_holds(
     assert row.worst_ratio > 1.3  # nobody could find out
 
 
+@pytest.mark.thorough
 def test_one_that_is_certain_along_one_axis_only_leads_nobody_astray(
     short: dict[tuple[str, str], AttackRow],
 ) -> None:
@@ -95,12 +99,14 @@ def test_a_guest_of_ever_new_names_leads_nobody_astray_beside_one_correct_observ
     assert row.false_quarantines == 0
 
 
+@pytest.mark.thorough
 def test_the_runs_to_compare_with_have_no_liar(short: dict[tuple[str, str], AttackRow]) -> None:
     for key in (("", "scout"), ("", "navigator")):
         assert short[key].worst_ratio == 1.0
         assert short[key].noticed == short[key].false_quarantines == 0
 
 
+@pytest.mark.thorough
 def test_the_table_says_which_aims_are_missed(
     short: dict[tuple[str, str], AttackRow], capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -137,6 +143,7 @@ def test_two_liars_are_no_majority_while_a_correct_observer_does_not_see_the_nav
     assert row.least_inside_3_sigma > 0.97
 
 
+@pytest.mark.thorough
 def test_no_correct_observer_is_quarantined_for_what_own_eyes_see_along_another_axis() -> None:
     """In this seed the landmarks were off by two sigmas in y, where the liars say nothing."""
     run = run_attack(EVERY["one axis", "navigator"], 2)

@@ -66,9 +66,15 @@ def distrust_without_liars(
 
 
 @pytest.mark.timeout(300)
-def test_no_correct_robot_is_quarantined_in_two_runs() -> None:
-    assert distrust_without_liars("three observers", [1], 25.0) == []
-    assert distrust_without_liars("biased sensors", [2], 25.0) == []
+@pytest.mark.parametrize(
+    ("shape", "seed"),
+    [
+        pytest.param("three observers", 1, marks=pytest.mark.thorough),
+        ("biased sensors", 2),
+    ],
+)
+def test_no_correct_robot_is_quarantined_in_two_runs(shape: str, seed: int) -> None:
+    assert distrust_without_liars(shape, [seed], 25.0) == []
 
 
 @pytest.mark.long
@@ -92,6 +98,7 @@ def test_observers_that_stand_for_three_minutes_are_still_believed() -> None:
         assert run.score.inside_3_sigma > 0.97
 
 
+@pytest.mark.thorough
 def test_a_drifting_observer_that_states_a_small_sigma_is_found_and_does_little_harm() -> None:
     fault = Fault.parse("drift:0.02,0.0,0.01@10-45")
     through = {liars.LIAR: partial(FaultyBus, fault=fault, name=liars.LIAR, start_ns=0)}

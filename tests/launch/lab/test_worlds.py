@@ -4,7 +4,7 @@ import math
 
 import pytest
 from support.processes import command_line
-from support.sweeps import over_seeds
+from support.sweeps import over_seeds, sampled
 
 from cpcbl_launch.lab.experiments import world_list
 from cpcbl_launch.lab.experiments.worlds import (
@@ -38,6 +38,13 @@ QUICK = (  # the worlds of the findings, each as short as it may be
     "precise ranges 15% too short, 4 landmarks",
     "start unknown",
     "uncertain map, 2 landmarks",
+    "unsurveyed, 0 of 8 known",
+)
+ALWAYS = (
+    "1 landmark bearing-only",
+    "50% of odometry lost, 4 landmarks",
+    "carried away, 2 landmarks",
+    "precise ranges 15% too short, 2 landmarks",
     "unsurveyed, 0 of 8 known",
 )
 
@@ -122,7 +129,7 @@ def figures(names: tuple[str, ...], variants: tuple[str, ...], seeds: int) -> di
 
 
 @over_seeds(3, 5)
-@pytest.mark.parametrize("world", QUICK)
+@pytest.mark.parametrize("world", sampled(QUICK, ALWAYS))
 def test_a_robot_knows_how_far_it_errs_outside_the_usual_case(world: str, seeds: range) -> None:
     """A few seeds of the worlds in which it once did not; the same noise every time."""
     found = figures((world,), ("joint",), len(seeds))

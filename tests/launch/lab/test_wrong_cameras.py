@@ -77,6 +77,7 @@ def quarantined(report: Report) -> int:
     return sum(robot.counts.get("quarantined", 0) for robot in report.robots.values())
 
 
+@pytest.mark.thorough
 @WITHIN
 def test_a_wrong_yaw_misleads_nobody_in_the_first_seconds(monkeypatch: pytest.MonkeyPatch) -> None:
     report = report_with(monkeypatch, KINDS["yaw"], 1, 3.0)
