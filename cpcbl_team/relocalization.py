@@ -119,6 +119,7 @@ class PropagatedEvidence:
         self._teammate_rad = factor * evidence.teammate_sigma_rad
         self.sigma_m = math.hypot(self._teammate_m, drift_m)
         self._sigma_rad = math.hypot(self._teammate_rad, drift_rad)
+        self._range_variance = _variance(evidence.range_sigma_m**2 + self.sigma_m**2)
 
     def pose(self) -> Pose2 | None:
         """The present pose (field_from_robot), if a fix holds the whole of it."""
@@ -139,45 +140,50 @@ class PropagatedEvidence:
     def rows(self, pose: Pose2) -> list[tuple[Row, float, float]]:
         """(row, residual, variance) about the present pose."""
         then = pose @ self.now_from_then
-        hx, hy = pose.y - then.y, then.x - pose.x  # d(position then) / d(heading now)
-        return [
-            ((x, y, a + x * hx + y * hy), residual, variance)
-            for (x, y, a), residual, variance in self._rows_then(
-                then, self.sigma_m, self._sigma_rad
-            )
-        ]
+        lever = pose.y - then.y, then.x - pose.x  # d(position then) / d(heading now)
+        return self._rows_then(then, lever, self.sigma_m, self._sigma_rad, self._range_variance)
 
     def rows_without_drift(self, then: Pose2) -> list[tuple[Row, float, float]]:
         """(row, residual, variance) about the pose of that time."""
-        return self._rows_then(then, self._teammate_m, self._teammate_rad)
+        sigma_m, sigma_rad = self._teammate_m, self._teammate_rad
+        range_variance = _variance(self.evidence.range_sigma_m**2 + sigma_m**2)
+        return self._rows_then(then, (0.0, 0.0), sigma_m, sigma_rad, range_variance)
 
     def _rows_then(
-        self, then: Pose2, sigma_m: float, sigma_rad: float
+        self,
+        then: Pose2,
+        lever: tuple[float, float],
+        sigma_m: float,
+        sigma_rad: float,
+        range_variance: float,
     ) -> list[tuple[Row, float, float]]:
-        """The same, with these sigmas beside the sensor's."""
-        e = self.evidence
+        """About a pose that has this lever on the pose of that time, with these sigmas beside the
+        sensor's."""
+        e, (hx, hy) = self.evidence, lever
         if self.is_fix:
-            return _rows_of_fix(e, then, sigma_m, sigma_rad)
-        dx, dy = e.x - then.x, e.y - then.y
+            return _rows_of_fix(e, then, lever, sigma_m, sigma_rad)
+        then_x, then_y, then_heading = then
+        dx, dy = e.x - then_x, e.y - then_y
         distance = math.hypot(dx, dy)
         if distance < NEAREST_M:
             return []
         rows = []
         if e.range_m is not None:
             u, v, residual = circle(dx, dy, distance, e.range_m)
-            rows.append(((u, v, 0.0), residual, _variance(e.range_sigma_m**2 + sigma_m**2)))
+            rows.append(((u, v, 0.0 + u * hx + v * hy), residual, range_variance))
         if e.bearing_rad is not None:
-            u, v, residual = heading_of(dx, dy, distance**2, e.bearing_rad, then.heading)
+            u, v, residual = heading_of(dx, dy, distance**2, e.bearing_rad, then_heading)
             spread = math.hypot(sigma_m / distance, sigma_rad)
-            rows.append(((u, v, 1.0), residual, _variance(e.bearing_sigma_rad**2 + spread**2)))
+            variance = _variance(e.bearing_sigma_rad**2 + spread**2)
+            rows.append(((u, v, 1.0 + u * hx + v * hy), residual, variance))
         return rows
 
 
 def _rows_of_fix(
-    e: Evidence, then: Pose2, sigma_m: float, sigma_rad: float
+    e: Evidence, then: Pose2, lever: tuple[float, float], sigma_m: float, sigma_rad: float
 ) -> list[tuple[Row, float, float]]:
-    variance = _variance(sigma_m**2 + e.range_sigma_m**2)
-    rows = [((1.0, 0.0, 0.0), e.x - then.x, variance), ((0.0, 1.0, 0.0), e.y - then.y, variance)]
+    variance, (hx, hy) = _variance(sigma_m**2 + e.range_sigma_m**2), lever
+    rows = [((1.0, 0.0, hx), e.x - then.x, variance), ((0.0, 1.0, hy), e.y - then.y, variance)]
     if e.heading_rad is not None:
         off = math.remainder(e.heading_rad - then.heading, math.tau)
         rows.append(((0.0, 0.0, 1.0), off, _variance(sigma_rad**2 + e.bearing_sigma_rad**2)))
@@ -185,7 +191,8 @@ def _rows_of_fix(
 
 
 def _variance(variance: float) -> float:
-    return max(variance + SMALLEST_VARIANCE, _SHARPEST)
+    variance += SMALLEST_VARIANCE
+    return variance if variance > _SHARPEST else _SHARPEST
 
 
 def _cost(pose: Pose2, pieces: list[PropagatedEvidence]) -> float:
