@@ -8,7 +8,7 @@ COMPILED = build/compiled
 # Where it is set, each process that the tests start compiles whatever it imports once more.
 export PYTHONDONTWRITEBYTECODE =
 
-.PHONY: setup demo test quick check unit test-thorough test-long test-recordings test-ros2 test-trial test-compiled test-docker test-bench \
+.PHONY: setup peers demo test quick check unit test-thorough test-long test-recordings test-ros2 test-trial test-compiled test-docker test-bench \
   chaos net recording fuzz luck compiled bench bench-degraded bench-detection bench-latency bench-pictures \
   bench-processes bench-scaling bench-view bench-pairs bench-mapping screenshot clean
 
@@ -48,7 +48,7 @@ unit: setup
 
 # More worlds, seeds, images and attacks than `make test` samples, with the same bounds.
 test-thorough: setup
-	$(BIN)/pytest -n 3 --dist worksteal -m thorough
+	$(BIN)/pytest -n 2 --dist worksteal -m thorough
 
 USUAL = not thorough and not long and not log and not pictures and not docker and not trial and not ros2 and not recordings
 
@@ -126,10 +126,15 @@ $(COMPILED)/ready: $(VENV)/ready hatch_build.py $(wildcard cpcbl_team/*.py cpcbl
 	  --explicit-package-bases --ignore-missing-imports benchmarks/float_ekf.py > mypyc.log
 	@touch $@
 
-# The variants of the localizer and their peers of the extra `bench` compute the same; so do a cluster
-# and this machine.
-test-bench: setup compiled
+# What the benchmarks compare with: the extra `bench`.
+peers: $(VENV)/peers
+
+$(VENV)/peers: $(VENV)/ready
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev,bench]'
+	@touch $@
+
+# The variants of the localizer and their peers compute the same; so do a cluster and this machine.
+test-bench: peers compiled
 	$(BIN)/pytest -q tests/benchmarks/test_contenders.py tests/benchmarks/test_compiled.py \
 	  tests/benchmarks/test_viewers.py tests/benchmarks/test_mapping.py tests/launch/lab/test_seeds.py
 
@@ -150,14 +155,12 @@ bench-detection bench-latency bench-pictures bench-processes bench-scaling bench
 	PYTHONPATH=$(BENCH_PATH) $(BIN)/python -m benchmarks.$(@:bench-%=%) $(ARGS)
 
 # A robot's detector beside two others on frames of a bad camera; ARGS='--family aruco_4x4_50'.
-bench-degraded: setup
+bench-degraded: peers
 	@mkdir -p build
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev,bench]'
 	PYTHONPATH=$(BENCH_PATH) $(BIN)/python -m benchmarks.degraded $(ARGS)
 
 # `calibrate map` beside GTSAM; ARGS='MRCLAM2 MRCLAM4 --known 6,20 --team'.
-bench-mapping: setup
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev,bench]'
+bench-mapping: peers
 	PYTHONPATH=$(BENCH_PATH) $(BIN)/python -m benchmarks.mapping $(ARGS)
 
 # The view with teams of 4, 50 and 200 robots in Chromium; docs/view.png, a picture of the demo, and

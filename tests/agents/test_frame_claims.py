@@ -60,8 +60,8 @@ def with_fourth() -> Team:
 @pytest.mark.parametrize(
     "frames",
     [
-        ("field",),
-        (frame_name("pioneer", 0),),
+        pytest.param(("field",), marks=pytest.mark.thorough),
+        pytest.param((frame_name("pioneer", 0),), marks=pytest.mark.thorough),
         tuple(frame_name("pioneer", k * 10**8) for k in range(50, 0, -1)),
     ],
     ids=["the field", "an older one", "ever older ones"],

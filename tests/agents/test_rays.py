@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 from support.drivers import Change, DrivenRobot, Sent, World, as_it_is
 from support.mistake_rows import ODOMETRY
+from support.sweeps import sampled
 
 from cpcbl_agents.input_diagnosis.rays import NEAREST_M, ray_error
 from cpcbl_team.geometry import Pose2
@@ -91,7 +92,9 @@ def test_nothing_is_said_of_a_correct_driver(world: World) -> None:
     assert said == set()
 
 
-@pytest.mark.parametrize("name", ["backwards", "mm", "cm", "poses", "headings"])
+@pytest.mark.parametrize(
+    "name", sampled(["backwards", "mm", "cm", "poses", "headings"], ["backwards", "poses"])
+)
 def test_a_mistake_is_said_within_seconds(name: str) -> None:
     row, robot = ODOMETRY[name], DrivenRobot(PAST)
     robot.run(8.0, without_ranges(row.make()))

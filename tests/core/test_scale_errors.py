@@ -21,6 +21,7 @@ from support.core import (
     matrix3,
     sensor_noise,
 )
+from support.sweeps import sampled
 
 from cpcbl_team.config import (
     LocalizerSettings,
@@ -225,7 +226,7 @@ def run(robot: Localizer, seed: int, seconds: int = 60) -> tuple[State, Figures]
     return state, Figures(float(np.mean(squares)), float(np.mean(np.array(squares) < 11.83)))
 
 
-@pytest.mark.parametrize("variant", PROBABILISTIC)
+@pytest.mark.parametrize("variant", sampled(PROBABILISTIC, ["joint"]))
 def test_sigma_of_dead_reckoning_holds_with_wheels_of_another_day(variant: Variant) -> None:
     figures = [run(robot_of(variant), seed)[1] for seed in range(12)]
     assert np.mean([f.nees for f in figures]) < 2.6

@@ -113,6 +113,7 @@ def test_a_secured_team_does_as_well_as_one_without_a_network(tmp_path: Path) ->
     assert report["team"]["inside_3_sigma"] > 0.9
 
 
+@pytest.mark.thorough
 def test_an_observer_joins_a_secured_team_with_its_own_certificate(tmp_path: Path) -> None:
     secured, endpoint = demo(tmp_path, "mtls"), free_endpoint("tls")
     secured.write_text(secured.read_text() + f'listen = ["{endpoint}"]\n')

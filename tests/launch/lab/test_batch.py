@@ -52,6 +52,7 @@ def test_the_batch_is_the_ceiling_and_consistent(tmp_path: Path, seeds: range) -
     assert np.mean([figure(batch, "nees") for batch in batches]) == pytest.approx(2.0, abs=0.4)
 
 
+@pytest.mark.thorough
 def test_the_batch_bears_wrong_sightings(tmp_path: Path) -> None:
     """Every twentieth range is 3 m too long: the error stays below that of the filter."""
     logged = noisy_log(tmp_path, 9, 20.0)

@@ -74,7 +74,9 @@ def assert_checks_met(outcome: Outcome) -> None:
 @pytest.mark.parametrize(
     "scenario",
     [
-        pytest.param(s, id=s.name, marks=() if s.name == "kill-robot" else pytest.mark.long)
+        pytest.param(
+            s, id=s.name, marks=pytest.mark.thorough if s.name == "kill-robot" else pytest.mark.long
+        )
         for s in SCENARIOS
         if s.quick
     ],

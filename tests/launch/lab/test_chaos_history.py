@@ -183,7 +183,10 @@ def test_a_consistent_robot_is_within_its_bounds_and_a_bold_one_is_not() -> None
         assert known.nees > known.nees_bound
 
 
-@pytest.mark.parametrize(("fusion", "seed"), [("split-ci", 1), ("split-ci", 2), ("naive", 1)])
+@pytest.mark.parametrize(
+    ("fusion", "seed"),
+    [("split-ci", 1), pytest.param("split-ci", 2, marks=pytest.mark.thorough), ("naive", 1)],
+)
 def test_a_rumour_shows_naive_fusion_and_no_other(fusion: str, seed: int) -> None:
     (rumour,) = select_scenarios(["rumour"])
     assert isinstance(rumour.run, TeamFault)

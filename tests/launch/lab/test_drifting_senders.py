@@ -118,6 +118,7 @@ def test_a_drifting_observer_that_states_a_small_sigma_is_found_and_does_little_
         assert figures.position_rmse_m < 0.08, name
 
 
+@pytest.mark.thorough
 @pytest.mark.timeout(300)
 def test_a_sudden_error_beside_one_correct_observer_is_decided_by_the_earlier_estimate() -> None:
     """Test 3 called both observers contested before test 1 could decide; odometry was lost then."""

@@ -38,7 +38,7 @@ def test_the_bounds_are_those_of_chi_square() -> None:
     ("choice", "honest"),
     [
         pytest.param(SPLIT, True, marks=pytest.mark.long),
-        (MUTUAL, True),
+        pytest.param(MUTUAL, True, marks=pytest.mark.thorough),
         pytest.param(MUTUAL_NAIVE, False, marks=pytest.mark.long),
     ],
 )
@@ -51,7 +51,12 @@ def test_information_that_circulates_between_two_robots_is_used_once(
 
 
 @pytest.mark.parametrize(
-    ("choice", "honest"), [(SPLIT, True), (MUTUAL, True), (MUTUAL_NAIVE, False)]
+    ("choice", "honest"),
+    [
+        pytest.param(SPLIT, True, marks=pytest.mark.thorough),
+        (MUTUAL, True),
+        (MUTUAL_NAIVE, False),
+    ],
 )
 def test_standing_robots_that_see_only_each_other_know_no_more_than_all_starts_together(
     choice: Overrides, honest: bool

@@ -10,6 +10,7 @@ import msgspec
 import numpy as np
 import pytest
 from support.processes import command_line
+from support.sweeps import sampled
 
 from cpcbl_launch.commands.experimenting import conduct
 from cpcbl_launch.lab.experiments import directions, figure7, runs, table1
@@ -65,7 +66,7 @@ def without_noise(team: Team) -> Team:
     return msgspec.structs.replace(team, simulation=quiet)
 
 
-@pytest.mark.parametrize("name", EVERY)
+@pytest.mark.parametrize("name", sampled(EVERY, ["figure7"]))
 def test_an_experiment_writes_json_and_picture_and_shows_a_table(
     name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

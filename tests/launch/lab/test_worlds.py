@@ -44,8 +44,8 @@ ALWAYS = (
     "1 landmark bearing-only",
     "50% of odometry lost, 4 landmarks",
     "carried away, 2 landmarks",
-    "precise ranges 15% too short, 2 landmarks",
-    "unsurveyed, 0 of 8 known",
+    "helper with heading σ 20 deg",
+    "uncertain map, 2 landmarks",
 )
 
 

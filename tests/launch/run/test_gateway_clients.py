@@ -103,6 +103,7 @@ def test_drivers_without_zenoh_feed_their_robots_and_get_poses(tmp_path: Path) -
     assert "connected to the router" in (logs / "gateway.log").read_text()
 
 
+@pytest.mark.thorough
 def test_with_keys_the_gateway_speaks_https_by_its_own_certificate(tmp_path: Path) -> None:
     port = int(free_endpoint().rpartition(":")[2])
     team, keys = tmp_path / "team.toml", tmp_path / "keys" / "gateway"

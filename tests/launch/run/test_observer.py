@@ -172,7 +172,11 @@ def rmse_without_guest_m(seed: int) -> float:
     "seed", [1, *(pytest.param(seed, marks=pytest.mark.long) for seed in (2, 3))]
 )
 @pytest.mark.parametrize(
-    ("wish", "share"), [(TRIPOD, 0.3), (ROVER, 0.6)], ids=["tripod camera", "GPS robot"]
+    ("wish", "share"),
+    [
+        pytest.param(TRIPOD, 0.3, id="tripod camera"),
+        pytest.param(ROVER, 0.6, id="GPS robot", marks=pytest.mark.thorough),
+    ],
 )
 def test_robots_get_better_while_a_guest_is_there_and_worse_again(
     wish: ObserverRequest, share: float, seed: int

@@ -167,6 +167,7 @@ def test_through_the_bridge_robots_are_as_accurate_as_without_it(tmp_path: Path)
         assert ros2.rmse_m[name] == pytest.approx(rmse_m, rel=0.15, abs=0.005), name
 
 
+@pytest.mark.thorough
 def test_the_bridge_survives_the_restarts_of_both_routers(tmp_path: Path) -> None:
     team, ros = free_endpoint(), free_endpoint()
     path = tmp_path / "team.toml"
@@ -268,6 +269,7 @@ def robot_goes_where_rviz_says(node: RosNode, drive: Callable[[], bool]) -> Call
     return is_there
 
 
+@pytest.mark.thorough
 def test_the_bridge_of_a_secured_team_has_a_certificate_of_its_own(tmp_path: Path) -> None:
     team, ros = free_endpoint("tls"), free_endpoint()
     path = tmp_path / "team.toml"
