@@ -1,7 +1,6 @@
 """THE table of the commands of `cpcbl-team`."""
 
 import importlib
-import importlib.metadata
 from typing import Annotated
 
 import typer
@@ -44,6 +43,8 @@ COMMANDS = {
 
 def _print_version(asked: bool) -> None:
     if asked:
+        import importlib.metadata  # it loads the modules of e-mail
+
         typer.echo(f"cpcbl-team {importlib.metadata.version('cpcbl-team')}")
         raise typer.Exit
 
