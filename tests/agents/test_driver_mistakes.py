@@ -137,7 +137,7 @@ def first_and_other_worlds() -> Iterator[Any]:
             yield pytest.param(row, row.worlds[1:], id=others, marks=pytest.mark.thorough)
 
 
-@pytest.mark.parametrize(("row", "worlds"), first_and_other_worlds())
+@pytest.mark.parametrize(("row", "worlds"), list(first_and_other_worlds()))
 def test_one_line_names_the_cause_soon_and_stays(row: Row, worlds: Sequence[World]) -> None:
     for world in worlds:
         robot = DrivenRobot(world)
