@@ -97,6 +97,7 @@ def changed(one: Pixels, other: Pixels) -> int:
     return int((np.abs(one.astype(int) - other).max(axis=2) > 8).sum())
 
 
+@pytest.mark.thorough
 def test_the_visible_shares_agree_with_rendered_pixels() -> None:
     """A landmark is there to be seen where the picture without it is another one."""
     whole = gone = part = 0

@@ -28,7 +28,7 @@ from support.core import (
     position_error,
     state_at,
 )
-from support.sweeps import over_seeds
+from support.sweeps import over_seeds, sampled
 
 from cpcbl_team.config import (
     CollaborationSettings,
@@ -314,7 +314,7 @@ MOST_HEADING_NEES = 1.0 + 1.645 * math.sqrt(2.0 / 40.0)
 
 
 @pytest.mark.parametrize(("fusion", "honest"), [("split-ci", True), ("naive", False)])
-@probabilistic
+@pytest.mark.parametrize("variant", sampled(PROBABILISTIC, ["joint"]))
 def test_an_observer_whose_heading_is_off_gets_no_more_weight_than_due(
     variant: Variant, fusion: Fusion, honest: bool
 ) -> None:

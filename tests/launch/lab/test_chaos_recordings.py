@@ -51,6 +51,7 @@ def test_recordings_are_kept_where_the_team_did_not_get_so_far(
     assert (tmp_path / "run" / "r1").exists()
 
 
+@pytest.mark.thorough
 def test_each_robot_of_a_recorded_team_records(tmp_path: Path) -> None:
     plan = RunPlan(demo_team(), watched=True, recordings=tmp_path)
     with run_team(plan) as team:

@@ -62,6 +62,7 @@ def test_naive_merging_is_noticed(seed: int) -> None:
     assert NEES in unmet_checks(verdict(rumour(), seed, merged_naively))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("seed", SEEDS)
 def test_late_help_that_is_taken_for_new_is_noticed(
     seed: int, monkeypatch: pytest.MonkeyPatch

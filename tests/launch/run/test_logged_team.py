@@ -188,7 +188,11 @@ def test_choices_are_made_for_all_robots_and_nothing_else() -> None:
 )
 @pytest.mark.parametrize(
     ("kinds", "limit_m"),
-    [("none", MILLIMETRE), ("active", OF_FIXES_M), ("both", TURNING_MATE_M)],
+    [
+        pytest.param("none", MILLIMETRE, marks=pytest.mark.thorough),
+        pytest.param("active", OF_FIXES_M, marks=pytest.mark.thorough),
+        ("both", TURNING_MATE_M),
+    ],
 )
 @pytest.mark.parametrize("blind", [[], ["2"]], ids=["full map", "blind"])
 def test_a_log_without_noise_gives_no_errors(

@@ -124,7 +124,11 @@ def team3(tmp_path: Path) -> Team3:
 
 @pytest.mark.parametrize(
     "number",
-    [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.long), signal.SIGKILL],
+    [
+        signal.SIGINT,
+        pytest.param(signal.SIGTERM, marks=pytest.mark.long),
+        pytest.param(signal.SIGKILL, marks=pytest.mark.thorough),
+    ],
 )
 def test_an_observer_joins_a_running_team_and_leaves_it(
     team3: Team3, number: signal.Signals
@@ -240,6 +244,7 @@ def test_two_of_one_name_are_not_let_in(team3: Team3) -> None:
     assert "the team has one of this name" in team3.said[1][1]
 
 
+@pytest.mark.thorough
 def test_a_field_that_is_restarted_has_its_guests_again(team3: Team3) -> None:
     def field_dies(recorder: Recorder) -> bool:
         (pid,) = pids_of(["cpcbl_launch field", team3.endpoint])

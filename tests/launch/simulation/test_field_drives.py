@@ -7,6 +7,7 @@ from typing import Any
 import msgspec
 import pytest
 from support.fields import LOOP, MILLIMETRE, marks
+from support.sweeps import sampled
 
 from cpcbl_launch.simulation.in_process import simulate
 from cpcbl_launch.team.file import builtin_path, load_team
@@ -29,7 +30,7 @@ TURNING_MATE_M = 0.005  # a teammate that turns is believed to drive on until it
 
 @pytest.mark.parametrize(
     ("kinds", "limit_m"),
-    [("none", MILLIMETRE), ("both", TURNING_MATE_M)],
+    [pytest.param("none", MILLIMETRE, marks=pytest.mark.thorough), ("both", TURNING_MATE_M)],
 )
 def test_robots_drive_their_loops_by_their_own_estimates(kinds: str, limit_m: float) -> None:
     demo = load_team(builtin_path("demo"))
@@ -73,7 +74,9 @@ EXACT_ODOMETRY = OdometrySettings(
     ids=["range", "bearing", "range and bearing"],
 )
 @pytest.mark.parametrize("odometry", [OdometrySettings(), EXACT_ODOMETRY], ids=["usual", "exact"])
-@pytest.mark.parametrize("variant", ["joint", "oval", "circular", "weighted"])
+@pytest.mark.parametrize(
+    "variant", sampled(["joint", "oval", "circular", "weighted"], ["joint", "weighted"])
+)
 @pytest.mark.parametrize("duration_s", [8.0, pytest.param(20.0, marks=pytest.mark.long)])
 def test_a_sensor_that_never_errs_stops_no_robot(
     sensor: dict[str, Any], odometry: OdometrySettings, variant: Variant, duration_s: float
@@ -101,7 +104,7 @@ def test_a_sensor_that_never_errs_stops_no_robot(
     assert [r.samples > 10 * duration_s - 10 for r in report.robots.values()] == [True, True]
 
 
-@pytest.mark.parametrize("delay_s", [0.0, 0.3])
+@pytest.mark.parametrize("delay_s", sampled([0.0, 0.3], [0.3]))
 def test_a_position_sensor_keeps_a_robot_that_sees_nothing_on_its_way(delay_s: float) -> None:
     """However late it is, as long as the settings say so."""
     sensor = PositionSensor(sigma_m=0.03, rate_hz=5.0, delay_s=delay_s)
