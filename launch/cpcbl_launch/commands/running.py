@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 from msgspec.structs import replace
-from rich.console import Console
 from typer import Option
 
 from cpcbl_agents.clock import Clock
@@ -26,6 +25,8 @@ from cpcbl_transport.security import Identity, link_of
 from cpcbl_transport.topics import Role
 
 if TYPE_CHECKING:
+    from rich.console import Console
+
     from cpcbl_launch.run.up import Launch, Run
     from cpcbl_launch.views.web.address import Listen
     from cpcbl_transport.bus import Bus
@@ -86,6 +87,8 @@ def up(
     open_page: options.OpenPage = False,
 ) -> None:
     """Start a team: the field, a process per robot, a live table, a report at the end."""
+    from rich.console import Console
+
     from cpcbl_agents.stop import StopSignal
     from cpcbl_launch.run.up import router_endpoint, run_team
     from cpcbl_launch.views.run import LiveTable, print_report
@@ -119,7 +122,7 @@ def _own_recording(team: Team) -> Path | None:
     return Path(folder) / time.strftime("%Y%m%d-%H%M%S", time.gmtime()) if folder else None
 
 
-def _print_how_to_watch(file: Path | None, endpoint: str, console: Console) -> None:
+def _print_how_to_watch(file: Path | None, endpoint: str, console: "Console") -> None:
     watch = ["cpcbl-team", "traffic", str(file or "demo"), "--connect", endpoint]
     console.print(f"watch it: {shlex.join(watch)}", style="dim", highlight=False, soft_wrap=True)
 
@@ -139,7 +142,7 @@ def _fail_without_data(run: "Run") -> None:
 
 @contextmanager
 def _page(
-    team: Team, listen: "Listen", open_page: bool, console: Console
+    team: Team, listen: "Listen", open_page: bool, console: "Console"
 ) -> "Iterator[Callable[[Bus], AbstractContextManager[object]]]":
     """Serves the page of a run; yields what attaches it to the run's bus."""
     from cpcbl_launch.views.web.feed import Feed
@@ -190,7 +193,7 @@ def _robots_here(text: str, team: Team) -> list[str]:
 
 
 def _launch(
-    run: "Run", containers: bool, image: str | None, base_image: str, console: Console
+    run: "Run", containers: bool, image: str | None, base_image: str, console: "Console"
 ) -> "Launch":
     if containers and run.connect:
         raise InputError("up: --connect or --containers, which have a router of their own")
