@@ -8,7 +8,6 @@ from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from functools import cache
 from hashlib import blake2b
-from importlib import metadata
 from pathlib import Path
 
 import msgspec
@@ -85,6 +84,8 @@ def program_version() -> str:
         for path in sorted(top.rglob("*.py")):
             digest.update(str(path.relative_to(top)).encode() + path.read_bytes())
     compiled = " compiled" if is_compiled() else ""
+    from importlib import metadata  # 1.6 MiB, for those alone that record
+
     return f"{metadata.version('cpcbl-team')} {digest.hexdigest()}{compiled}"
 
 
