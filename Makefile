@@ -48,7 +48,7 @@ unit: setup
 
 # More worlds, seeds, images and attacks than `make test` samples, with the same bounds.
 test-thorough: setup
-	$(BIN)/pytest -n 2 --dist worksteal -m thorough
+	$(BIN)/pytest -n 2 --dist worksteal -m "thorough and not long"
 
 USUAL = not thorough and not long and not log and not pictures and not docker and not trial and not ros2 and not recordings
 

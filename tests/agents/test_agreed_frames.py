@@ -115,6 +115,7 @@ def test_six_that_stand_agree_on_one_frame_though_each_began_its_own() -> None:
     assert_right(world)
 
 
+@pytest.mark.thorough
 def test_a_robot_that_is_started_again_joins_the_frame_that_it_began_itself() -> None:
     world = World(unmapped(), 1).run(6.0)
     world.stop("pioneer")
@@ -152,6 +153,7 @@ def test_the_loss_of_messages_delays_at_most() -> None:
     assert_right(world)
 
 
+@pytest.mark.thorough
 def test_after_a_partition_they_agree() -> None:
     buses: list[LossyBus] = []
 
@@ -237,6 +239,7 @@ def test_landmarks_that_give_one_number_suffice_beside_teammates(gives: str) -> 
     assert_right(world)
 
 
+@pytest.mark.thorough
 def test_landmarks_that_were_found_come_along() -> None:
     """Third finds some in the frame of second before it joins that of pioneer."""
     world = World(unmapped(), 1, late_s={"pioneer": 8.0})

@@ -77,6 +77,7 @@ def test_a_seed_makes_one_team() -> None:
     assert swarm_team(10, 1) == swarm_team(10, 1) != swarm_team(10, 2)
 
 
+@pytest.mark.thorough
 def test_robots_of_a_generated_team_drive_round_their_homes() -> None:
     team = swarm_team(4, 1)
     _, recorder = simulate(team, 1, 12.0)
@@ -103,6 +104,7 @@ def test_too_short_a_time_measures_nothing(duration_s: float) -> None:
         measure_sizes([2], 1, duration_s)
 
 
+@pytest.mark.thorough
 def test_the_same_seed_gives_the_same_figures_whatever_was_run_before() -> None:
     shown: list[float] = []
     both = measure_sizes([2, 6], 3, 2.0, shown.append)

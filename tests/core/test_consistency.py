@@ -26,7 +26,7 @@ from support.core import (
     sensor_noise,
     steered,
 )
-from support.sweeps import over_seeds
+from support.sweeps import over_seeds, sampled
 
 from cpcbl_launch.reporting.metrics import Samples, Score, score
 from cpcbl_team.config import (
@@ -172,7 +172,7 @@ def test_correlated_errors_are_claimed_as_such_where_their_time_is_known() -> No
 
 @over_seeds(3, 6)
 @pytest.mark.parametrize(("fusion", "honest"), [("split-ci", True), ("naive", False)])
-@pytest.mark.parametrize("variant", PROBABILISTIC)
+@pytest.mark.parametrize("variant", sampled(PROBABILISTIC, ["joint"]))
 def test_an_observer_that_is_off_is_not_believed_more_for_repeating_itself(
     variant: Variant, fusion: Fusion, honest: bool, seeds: range
 ) -> None:

@@ -160,6 +160,7 @@ def test_a_belief_that_comes_again_and_again_makes_nothing_certain() -> None:
     assert np.linalg.eigvalsh(matrix2(place))[0] > 0.05**2
 
 
+@pytest.mark.thorough
 def test_beliefs_that_came_from_this_robot_make_no_pose_overconfident() -> None:
     """A teammate has improved what this robot once said: seven tenths of its error are still in it.
     Three times it says so; taken as new each time, it would give a NEES of 4.4."""

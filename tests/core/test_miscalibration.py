@@ -175,6 +175,7 @@ def test_right_settings_of_a_robot_that_turns_on_the_spot_are_left_alone(
         assert adaptation_of(state) is AS_CONFIGURED
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("truth", "name", "low"),
     [

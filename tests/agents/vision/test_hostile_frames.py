@@ -96,6 +96,7 @@ def test_a_frame_that_comes_again_is_not_used_again() -> None:
     assert isinstance(detector.detect(Picture(4, pixels)), Sightings)
 
 
+@pytest.mark.thorough
 def test_a_camera_that_is_upside_down_is_said_and_tells_nothing() -> None:
     detector = CameraDetector("me", TEAM)
     seen = [detector.detect(Picture(n, robots_in_view(n)[::-1, ::-1].copy())) for n in range(5)]

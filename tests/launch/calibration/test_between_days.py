@@ -48,6 +48,7 @@ def test_a_bias_that_differs_is_found_with_its_variance() -> None:
     assert found["range"].noise == pytest.approx(SIGMA_M**2, rel=0.15)
 
 
+@pytest.mark.thorough
 def test_days_that_are_the_same_have_on_average_no_variance() -> None:
     """What chance makes of equal days is subtracted."""
     robots = [sensor_variances([day(2 * i), day(2 * i + 1)]) for i in range(8)]

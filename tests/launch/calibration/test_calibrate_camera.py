@@ -111,6 +111,7 @@ def in_sigmas(lens: LensCalibration) -> list[float]:
     ]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("name", BOARDS)
 def test_the_lens_is_found_within_its_standard_deviations(name: str) -> None:
     errors = []

@@ -106,6 +106,7 @@ def whole(seeing: CameraAccuracy, kind: str) -> AccuracyRow:
     return found
 
 
+@pytest.mark.thorough
 def test_a_camera_as_the_file_says_is_found_right_and_honest(honest: Path) -> None:
     seeing = accuracy_of(honest)
     for kind in ("landmarks", "teammates"):
@@ -128,6 +129,7 @@ def test_a_camera_as_the_file_says_is_found_right_and_honest(honest: Path) -> No
     assert "correlation_s" not in seeing.sensor
 
 
+@pytest.mark.thorough
 def test_a_lens_that_is_longer_and_looks_aside_is_found(wrong: Path) -> None:
     seeing = accuracy_of(wrong)
     landmarks = whole(seeing, "landmarks")

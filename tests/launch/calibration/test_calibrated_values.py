@@ -59,6 +59,7 @@ def found(recorded: Path) -> Calibration:
     return calibrate_robots(read_logs([recorded]), ["trio.mcap"])
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("key", BOUNDS)
 @pytest.mark.parametrize("robot", ["a", "b"])
 def test_what_the_field_was_told_is_found(robot: str, key: str, found: Calibration) -> None:
@@ -75,6 +76,7 @@ def test_what_the_field_was_told_is_found(robot: str, key: str, found: Calibrati
     assert estimate.standard_error <= bound
 
 
+@pytest.mark.thorough
 def test_depths_are_told_from_ranges_and_along_which_axis(found: Calibration) -> None:
     assert found.robots["a"].range_is_depth
     axis = found.robots["a"].sensor["optical_axis_deg"]
@@ -84,6 +86,7 @@ def test_depths_are_told_from_ranges_and_along_which_axis(found: Calibration) ->
     assert "optical_axis_deg" not in found.robots["b"].sensor
 
 
+@pytest.mark.thorough
 def test_a_robot_that_stands_keeps_its_odometry_and_says_so(found: Calibration) -> None:
     robot = found.robots["c"]
     assert robot.odometry == {}
@@ -93,6 +96,7 @@ def test_a_robot_that_stands_keeps_its_odometry_and_says_so(found: Calibration) 
     assert bias.standard_error < 0.2
 
 
+@pytest.mark.thorough
 def test_several_logs_are_pooled(recorded: Path) -> None:
     log = read_log(recorded)["a"]
     early = log.truth[:, 0] < 0.5 * SECONDS
@@ -102,6 +106,7 @@ def test_several_logs_are_pooled(recorded: Path) -> None:
     assert both.value == pytest.approx(0.93, abs=SIGMAS * both.standard_error)
 
 
+@pytest.mark.thorough
 def test_a_recorded_team_is_written_as_it_was(recorded: Path) -> None:
     team = read_recording(recorded).team
     assert team == TEAM

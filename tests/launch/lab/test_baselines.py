@@ -88,6 +88,7 @@ def test_filters_are_consistent_on_white_noise(
     assert np.mean([figure(run[kind], "inside_3_sigma") for run in runs]) > 0.97
 
 
+@pytest.mark.thorough
 def test_a_blind_robot_has_only_the_centralized_filter(tmp_path: Path) -> None:
     logged = noisy_log(tmp_path, 4, 20.0)
     full = reports_of(logged)
@@ -115,6 +116,7 @@ def test_without_sightings_of_robots_the_centralized_filter_is_many_solo_filters
 # Settings ----------------------------------------------------------------------------------------
 
 
+@pytest.mark.thorough
 def test_the_baselines_correct_inputs_as_the_team_does(tmp_path: Path) -> None:
     write_log(tmp_path, ROBOTS, 20.0)
     wheels, late = np.array([1.0, 1.25, 1.0 / 0.9]), np.array([0.1, 0.0, 0.0, 0.0])
@@ -136,6 +138,7 @@ def test_the_baselines_correct_inputs_as_the_team_does(tmp_path: Path) -> None:
         assert figure(corrected[kind]) == pytest.approx(0.0, abs=1e-4)
 
 
+@pytest.mark.thorough
 def test_a_repeated_sighting_is_ignored_or_weighted_less(tmp_path: Path) -> None:
     """Both leave a wider covariance; an interval of one frame uses every frame."""
     logged = noisy_log(tmp_path, 6, 10.0)

@@ -388,6 +388,7 @@ def test_an_echo_sends_every_message_twice_more() -> None:
         assert heard != sorted(heard)
 
 
+@pytest.mark.thorough
 def test_a_team_that_does_not_settle_raises_an_error_with_robot_and_reason() -> None:
     with run_team(RunPlan(demo_team(), relayed=("patrol",))) as team:
         team.links["patrol"].quality = LinkQuality(cut=True)

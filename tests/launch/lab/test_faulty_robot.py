@@ -209,6 +209,7 @@ def result() -> liars.Liars:
     return result_of(CASES)
 
 
+@pytest.mark.thorough
 def test_the_faulty_robot_is_detected_readmitted_and_does_little_harm(result: liars.Liars) -> None:
     alone, judged, believed = result.rows
     assert alone.found == alone.false_quarantines == judged.false_quarantines == 0
@@ -230,6 +231,7 @@ def test_the_same_seed_gives_the_same_figures(result: liars.Liars) -> None:
     assert again.rows[0] == result.rows[0]
 
 
+@pytest.mark.thorough
 def test_it_is_shown_in_80_columns_and_drawn(
     result: liars.Liars, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 from msgspec.structs import replace
 from support.planted_bugs import BUGS, planted
+from support.sweeps import sampled
 
 from cpcbl_launch.lab.luck.history import history_text
 from cpcbl_launch.lab.luck.outcome import run_history, run_seed
@@ -70,7 +71,7 @@ def test_the_digest_does_not_depend_on_the_hash_seed() -> None:
     assert len(digests) == 1
 
 
-@pytest.mark.parametrize("bug", FOUND)
+@pytest.mark.parametrize("bug", sampled(FOUND, ["ordering", "late data", "budget leak"]))
 def test_a_planted_bug_is_found(bug: str) -> None:
     invariant, seed = FOUND[bug]
     with planted(bug):

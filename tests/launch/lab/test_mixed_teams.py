@@ -18,6 +18,7 @@ def test_one_robot_in_five_sees_landmarks(size: int) -> None:
     assert mixed_team(size, seed=4) != team
 
 
+@pytest.mark.thorough
 def test_a_curve_of_simulated_teams_has_the_means_of_its_seeds(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

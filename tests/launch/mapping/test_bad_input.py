@@ -105,6 +105,7 @@ def test_a_landmark_that_moved_between_days() -> None:
 Place = Callable[[str, float, float], tuple[float, float]]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("place", "names", "words"),
     [

@@ -41,6 +41,7 @@ def mapped_room(
     return build_map(world.team, world.runs, Request(marks, place_sigma_m=0.0, walls=walls or {}))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("walls", "known", "words", "used"),
     [

@@ -54,6 +54,7 @@ def run(*words: object) -> str:
     return result.stdout
 
 
+@pytest.mark.thorough
 def test_walls_are_written_and_the_rest_of_the_file_stays(tmp_path: Path) -> None:
     file, picture = tmp_path / "team.toml", tmp_path / "map.png"
     file.write_text(TEAM)

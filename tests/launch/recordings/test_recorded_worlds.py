@@ -105,6 +105,7 @@ def test_a_robot_that_was_restarted_and_one_that_starts_late(tmp_path: Path) -> 
     assert result.processes[0].messages > 20
 
 
+@pytest.mark.thorough
 def test_a_team_that_agrees_on_a_frame(tmp_path: Path) -> None:
     """From its start, and from a state in the midst of it: candidates are part of it."""
     record_run(tmp_path, load_team(builtin_path("unmapped")), 1, 6.0)

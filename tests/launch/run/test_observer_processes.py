@@ -211,6 +211,7 @@ def test_a_container_may_read_the_keys_of_its_observer_and_of_nobody_else(tmp_pa
     assert mounts_of_keys("tripod", BLIND) == []
 
 
+@pytest.mark.thorough
 def test_after_its_time_an_observer_leaves_and_says_what_it_did(team3: Team3) -> None:
     def over(recorder: Recorder) -> bool:
         return team3.observers[0].poll() is not None

@@ -51,6 +51,7 @@ def test_robots_drive_their_loops_by_their_own_estimates(kinds: str, limit_m: fl
     assert ("scout" in helped) is (kinds == "both")
 
 
+@pytest.mark.thorough
 def test_robots_pass_their_waypoints() -> None:
     demo = load_team(builtin_path("demo"))
     quiet = msgspec.structs.replace(demo, simulation=SimulationSettings(noise=0.0))
