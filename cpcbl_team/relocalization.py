@@ -44,6 +44,8 @@ MOST_WIDENING = 4.0  # of the variance along it
 LEAST_RISE = 0.5  # of the chi-square, against that of the Gaussian,
 FAR = 32.0  # which counts as this at most
 UNKNOWNS = 3  # of a pose
+Rows = list[tuple[Row, float, float]]  # with the residual and the variance of each
+Lever = tuple[float, float]  # by how much x and y then change with the heading now
 _OPEN = Covariance3(1e6, 0.0, 1e6, 0.0, 0.0, 1e3)
 _STEP = Covariance3(9.0, 0.0, 9.0, 0.0, 0.0, 1.0)  # how far one iteration of a fit may lead
 _SHARPEST = 1e-6  # (1 mm)^2, (1 mrad)^2: sharper evidence drowns _OPEN in rounding
@@ -137,28 +139,22 @@ class PropagatedEvidence:
             return None
         return self.now_from_then.transform(r * math.cos(a), r * math.sin(a))
 
-    def rows(self, pose: Pose2) -> list[tuple[Row, float, float]]:
+    def rows(self, pose: Pose2) -> Rows:
         """(row, residual, variance) about the present pose."""
         then = pose @ self.now_from_then
         lever = pose.y - then.y, then.x - pose.x  # d(position then) / d(heading now)
         return self._rows_then(then, lever, self.sigma_m, self._sigma_rad, self._range_variance)
 
-    def rows_without_drift(self, then: Pose2) -> list[tuple[Row, float, float]]:
+    def rows_without_drift(self, then: Pose2) -> Rows:
         """(row, residual, variance) about the pose of that time."""
         sigma_m, sigma_rad = self._teammate_m, self._teammate_rad
         range_variance = _variance(self.evidence.range_sigma_m**2 + sigma_m**2)
         return self._rows_then(then, (0.0, 0.0), sigma_m, sigma_rad, range_variance)
 
     def _rows_then(
-        self,
-        then: Pose2,
-        lever: tuple[float, float],
-        sigma_m: float,
-        sigma_rad: float,
-        range_variance: float,
-    ) -> list[tuple[Row, float, float]]:
-        """About a pose that has this lever on the pose of that time, with these sigmas beside the
-        sensor's."""
+        self, then: Pose2, lever: Lever, sigma_m: float, sigma_rad: float, range_variance: float
+    ) -> Rows:
+        """About a pose with this lever on that of then, with these sigmas beside the sensor's."""
         e, (hx, hy) = self.evidence, lever
         if self.is_fix:
             return _rows_of_fix(e, then, lever, sigma_m, sigma_rad)
@@ -179,9 +175,7 @@ class PropagatedEvidence:
         return rows
 
 
-def _rows_of_fix(
-    e: Evidence, then: Pose2, lever: tuple[float, float], sigma_m: float, sigma_rad: float
-) -> list[tuple[Row, float, float]]:
+def _rows_of_fix(e: Evidence, then: Pose2, lever: Lever, sigma_m: float, sigma_rad: float) -> Rows:
     variance, (hx, hy) = _variance(sigma_m**2 + e.range_sigma_m**2), lever
     rows = [((1.0, 0.0, hx), e.x - then.x, variance), ((0.0, 1.0, hy), e.y - then.y, variance)]
     if e.heading_rad is not None:

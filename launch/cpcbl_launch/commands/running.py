@@ -87,8 +87,6 @@ def up(
     open_page: options.OpenPage = False,
 ) -> None:
     """Start a team: the field, a process per robot, a live table, a report at the end."""
-    from rich.console import Console
-
     from cpcbl_agents.stop import StopSignal
     from cpcbl_launch.run.up import router_endpoint, run_team
     from cpcbl_launch.views.run import LiveTable, print_report
@@ -101,7 +99,7 @@ def up(
     blind_team = with_blind_robots(run.team, options.parse_names(blind), run.left_out)
     here = _robots_here(robots, blind_team) if robots else None
     run = run._replace(team=blind_team, connect=tuple(connect or ()), here=here)
-    console = Console(stderr=as_json)
+    console = _console(as_json)
     launch = _launch(run, containers, image, base_image, console)
     _print_how_to_watch(file, router_endpoint(run), console)
     title = f"team {run.team.name}, {len(run.team.robots)} robots, {speed:g} x real time"
@@ -114,6 +112,12 @@ def up(
     options.print_result(result, as_json, lambda: print_report(result, console), lost, recorded)
     if not result.has_data and not StopSignal.was_interrupted:
         _fail_without_data(run)
+
+
+def _console(as_json: bool) -> "Console":
+    from rich.console import Console  # neither a router nor a field waits for it
+
+    return Console(stderr=as_json)
 
 
 def _own_recording(team: Team) -> Path | None:
