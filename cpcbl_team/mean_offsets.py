@@ -30,6 +30,9 @@ SLOW_COMMON_M: Final = 0.01
 the estimate, which differs between the times of their reports, the more the longer the mean."""
 CONFLICT: Final = 18.0
 """Two sources contradict each other beyond this chi-square (two degrees of freedom)."""
+CONFLICT_OF_MOST: Final = 36.0
+"""The same between own sensors and most senders, if these say the same: it is less likely that so
+many are wrong than that own sensors err by chance."""
 ALTERNATING_NS: Final = 200_000_000  # between two sources whose reports alternate
 USUAL: Final = 6.0  # 95 % of correct sources differ by less (chi-square, two degrees of freedom)
 LEAD: Final = 7.0
@@ -318,9 +321,12 @@ def both(fast: Comparison, slow: Comparison) -> Comparison:
     )
 
 
-def compared_with_own_sensors(mean: MeanOffset, own: MeanOffset, others: Means) -> Comparison:
+def compared_with_own_sensors(
+    mean: MeanOffset, own: MeanOffset, others: Means, heard: int = 0
+) -> Comparison:
     """A sender beside the robot's own sensors, which outweigh any number of others. Where this one
     and another contradict each other, they decide by which of both is clearly nearer to theirs.
+    `heard`: how many senders were heard lately, with this one and those in quarantine.
 
     The bias of a sender is its distance from its doubters: own sensors that are sure, and every
     other sender that is not clearly farther from these. How many others agree with it does not
@@ -333,12 +339,26 @@ def compared_with_own_sensors(mean: MeanOffset, own: MeanOffset, others: Means) 
     if is_sure:
         doubters.append(own)
     bias = max((bias_variance(mean, doubter) for doubter in doubters), default=0.0)
-    is_refuted = is_sure and disagreement(mean, own) > CONFLICT
+    apart = disagreement(mean, own) if is_sure else 0.0
+    is_doubted = apart > CONFLICT
+    is_refuted = is_doubted and (
+        apart > CONFLICT_OF_MOST or not _speaks_for_most(mean, own, others, heard)
+    )
     if is_refuted or any(ahead > LEAD for ahead in rivals):
         return Comparison(bias, is_wrong=True)
     is_contested = any(ahead >= -LEAD for ahead in rivals)
     is_left_out = any(ahead > NEARER for ahead in rivals)
-    return Comparison(bias, False, is_contested, not is_contested, is_left_out)
+    return Comparison(bias, False, is_contested, not (is_contested or is_doubted), is_left_out)
+
+
+def _speaks_for_most(mean: MeanOffset, own: MeanOffset, others: Means, heard: int) -> bool:
+    """Whether a sender is one of several that agree with each other, that own sensors doubt, and
+    that are more than half of all."""
+    agreeing = sum(
+        not contradicts(mean, other) and disagreement(other, own) > USUAL
+        for other in others.values()
+    )
+    return agreeing > 0 and 2 * (agreeing + 1) > max(heard, len(others) + 1)
 
 
 def compared_with_majority(mean: MeanOffset, others: Means) -> Comparison:

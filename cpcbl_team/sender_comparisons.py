@@ -225,16 +225,27 @@ def _comparison_of(senders: SenderRecords, name: str, now_ns: int, of: int) -> C
     record, mean = senders[name], senders[name].means[of]
     if record.offsets[of].stamp_ns != now_ns or mean is None or not mean.can_be_wrong:
         return None
-    return _result(mean, voting_means(senders, now_ns, name, of))
+    others = voting_means(senders, now_ns, name, of)
+    return _result(mean, others, _heard(senders, others, now_ns))
 
 
-def _result(mean: MeanOffset, others: Mapping[str, MeanOffset]) -> Comparison:
+def _heard(senders: SenderRecords, voting: Collection[str], now_ns: int) -> int:
+    """How many senders were heard lately, with those in quarantine and without guests that have no
+    vote."""
+    return sum(
+        now_ns - r.last_report_ns <= SILENCE_NS and (name in voting or not r.is_guest)
+        for name, r in senders.items()
+        if name != OWN_SENSORS
+    )
+
+
+def _result(mean: MeanOffset, others: Mapping[str, MeanOffset], heard: int) -> Comparison:
     """What the others say of a sender's mean: the robot's own sensors, or else the majority."""
     own = others.get(OWN_SENSORS)
     if own is None:
         return compared_with_majority(mean, others)
-    senders = {name: other for name, other in others.items() if name != OWN_SENSORS}
-    return compared_with_own_sensors(mean, own, senders)
+    of_senders = {name: other for name, other in others.items() if name != OWN_SENSORS}
+    return compared_with_own_sensors(mean, own, of_senders, heard)
 
 
 def wrong_turn(senders: SenderRecords, name: str, now_ns: int) -> MeanTurn | None:
@@ -287,9 +298,10 @@ def _contradicted(senders: SenderRecords, name: str, now_ns: int) -> tuple[Rival
         if mean is None or not mean.is_precise:
             continue
         means = {name: mean, **voting_means(senders, now_ns, name, of)}
+        heard = _heard(senders, means, now_ns)
         for other, its in means.items():
             if other == OWN_SENSORS or not contradicts(mean, its):
                 continue
-            if not _result(its, {n: m for n, m in means.items() if n != other}).is_wrong:
+            if not _result(its, {n: m for n, m in means.items() if n != other}, heard).is_wrong:
                 found[other] = Rival(other, its.x - mean.x, its.y - mean.y)
     return tuple(found.values())
