@@ -35,6 +35,7 @@ from cpcbl_team.sender_comparisons import (
     recent_senders,
     rival_of,
     senders_with_a_say,
+    supporters_of_estimate,
     votes,
     voting_means,
     with_comparison,
@@ -190,11 +191,8 @@ def _decide_dispute(
         return TrustDecision(senders, True)
     began_ns = min(disputes_ns)
     dissenters = {n for n, r in recent.items() if r.score > 0.5 * rules.limit}
-    supporters = {
-        n
-        for n, r in recent.items()
-        if n not in dissenters and r.last_agreement_ns > max(began_ns, r.dispute_since_ns)
-    }
+    claims = [r.mean_offset for r in recent.values() if r.score > rules.limit]
+    supporters = supporters_of_estimate(recent, dissenters, claims, began_ns)
     if not supporters:
         return TrustDecision(senders, True)
     if OWN_SENSORS not in dissenters | supporters:
