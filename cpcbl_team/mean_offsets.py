@@ -38,6 +38,8 @@ USUAL: Final = 6.0  # 95 % of correct sources differ by less (chi-square, two de
 LEAD: Final = 7.0
 """Of two that contradict each other one is clearly nearer to a third source by this difference of
 their chi-squares."""
+LEAD_ON_MOST: Final = 14.0
+"""The same if the other one says what most senders say."""
 NEARER: Final = 2.0
 """Of two senders one is probably nearer to the robot's own sensors by this difference of their
 chi-squares."""
@@ -333,7 +335,12 @@ def compared_with_own_sensors(
     matter. A contested sender is left out if a rival is nearer to the own sensors.
     """
     leads = [(other, lead(other, mean, own)) for other in others.values()]
-    rivals = [ahead for other, ahead in leads if contradicts(mean, other)]
+    friends, rivals = [], []
+    for other, ahead in leads:
+        if contradicts(mean, other):
+            rivals.append((other, ahead))
+        else:
+            friends.append(other)
     doubters = [other for other, ahead in leads if ahead >= -NEARER]
     is_sure = own.is_within(SURE_SIGMA_M)
     if is_sure:
@@ -341,24 +348,25 @@ def compared_with_own_sensors(
     bias = max((bias_variance(mean, doubter) for doubter in doubters), default=0.0)
     apart = disagreement(mean, own) if is_sure else 0.0
     is_doubted = apart > CONFLICT
-    is_refuted = is_doubted and (
-        apart > CONFLICT_OF_MOST or not _speaks_for_most(mean, own, others, heard)
+    number = max(heard, len(others) + 1)
+
+    def is_of_most(like_it: int) -> bool:
+        """Whether it and so many others, which own sensors are against as well, are most of all."""
+        return like_it > 0 and 2 * (like_it + 1) > number
+
+    is_refuted = apart > CONFLICT_OF_MOST or (
+        is_doubted and not is_of_most(sum(disagreement(f, own) > USUAL for f in friends))
     )
-    if is_refuted or any(ahead > LEAD for ahead in rivals):
+    is_behind = any(
+        ahead > LEAD_ON_MOST
+        or (ahead > LEAD and not is_of_most(sum(contradicts(rival, f) for f in friends)))
+        for rival, ahead in rivals
+    )
+    if is_refuted or is_behind:
         return Comparison(bias, is_wrong=True)
-    is_contested = any(ahead >= -LEAD for ahead in rivals)
-    is_left_out = any(ahead > NEARER for ahead in rivals)
+    is_contested = any(ahead >= -LEAD for _, ahead in rivals)
+    is_left_out = any(ahead > NEARER for _, ahead in rivals)
     return Comparison(bias, False, is_contested, not (is_contested or is_doubted), is_left_out)
-
-
-def _speaks_for_most(mean: MeanOffset, own: MeanOffset, others: Means, heard: int) -> bool:
-    """Whether a sender is one of several that agree with each other, that own sensors doubt, and
-    that are more than half of all."""
-    agreeing = sum(
-        not contradicts(mean, other) and disagreement(other, own) > USUAL
-        for other in others.values()
-    )
-    return agreeing > 0 and 2 * (agreeing + 1) > max(heard, len(others) + 1)
 
 
 def compared_with_majority(mean: MeanOffset, others: Means) -> Comparison:

@@ -195,11 +195,11 @@ def _decide_dispute(
     supporters = supporters_of_estimate(recent, dissenters, claims, began_ns)
     if not supporters:
         return TrustDecision(senders, True)
-    if OWN_SENSORS not in dissenters | supporters:
-        if any(r.name in supporters for n in dissenters for r in open_rivals(senders, n)):
-            return TrustDecision(senders, True)
-        if not members(recent, supporters) and len(members(recent, dissenters)) == 1:
-            return _without_decision(TrustDecision(senders, True), dissenters, now_ns)
+    if any(r.name in supporters for n in dissenters for r in open_rivals(senders, n)):
+        return TrustDecision(senders, True)
+    is_only_of_team = not members(recent, supporters) and len(members(recent, dissenters)) == 1
+    if is_only_of_team and OWN_SENSORS not in dissenters | supporters:
+        return _without_decision(TrustDecision(senders, True), dissenters, now_ns)
     is_right = _is_estimate_right(recent, dissenters, supporters, began_ns, now_ns)
     if is_right is None:
         return TrustDecision(senders, False)

@@ -248,30 +248,6 @@ def test_without_a_decision_of_own_sensors_even_a_majority_is_as_biased_as_it_is
     assert nearer.bias_variance == 0.0
 
 
-@pytest.mark.parametrize(
-    ("others", "heard", "apart_m", "is_wrong"),
-    [
-        ({}, 1, 0.21, True),
-        ({"a": 0.2}, 2, 0.21, False),
-        ({"a": 0.2}, 2, 0.3, True),  # then it is no chance
-        ({"a": 0.2, "b": 0.14}, 3, 0.21, False),
-        ({"a": 0.2, "b": 0.0, "c": 0.0}, 4, 0.21, True),  # half of them
-        ({"a": 0.2}, 4, 0.21, True),  # two others are in quarantine
-        ({"a": 0.2, "b": 0.05, "c": 0.05}, 4, 0.21, True),  # which own sensors do not doubt
-    ],
-)
-def test_own_sensors_contradict_most_senders_only_if_that_is_no_chance(
-    others: dict[str, float], heard: int, apart_m: float, is_wrong: bool
-) -> None:
-    """In a team without liars a navigator expelled three that agreed with each other: the mean of
-    its landmarks was off by four sigmas for half a second."""
-    own, rest = at(0.0, sigma=0.045), {name: at(x) for name, x in others.items()}
-    found = compared_with_own_sensors(at(apart_m), own, rest, heard)
-    assert found.is_wrong is is_wrong
-    assert not found.is_confirmed  # own sensors doubt it
-    assert found.bias_variance > 0.1**2
-
-
 def one_axis(x: float, y: float = 0.0) -> MeanOffset:
     """A source that states 8 mm in x and 25 cm in y."""
     return MeanOffset(x, y, Covariance2(0.008**2, 0.0, 0.25**2))

@@ -214,6 +214,18 @@ def test_one_that_is_too_vague_to_tell_supports_no_side_of_a_dispute(
     assert bool(decision.quarantined) is is_right
 
 
+@pytest.mark.parametrize("is_contest", [True, False])
+def test_single_readings_of_own_sensors_end_no_contest(is_contest: bool) -> None:
+    """Their mean does that: each reading alone agrees with both sides."""
+    senders = disputed(honest=1.2, liar=0.0, **{OWN_SENSORS: 0.0})
+    if is_contest:
+        for name, rival in (("honest", "liar"), ("liar", "honest")):
+            senders[name] = replace(senders[name], rivals=(Rival(rival, 0.1, 0.0),))
+    report = TeammateReport(10 * SECOND, CONTRADICTS, (0.1, 0.0))
+    decision = assess(senders, "honest", report, 0, RULES)
+    assert bool(decision.quarantined) is not is_contest
+
+
 def test_a_sender_below_the_limit_is_used_while_nobody_is_above_it() -> None:
     senders = disputed(east=0.7, a=0.0, b=0.0)
     assert assess(senders, "east", TeammateReport(10 * SECOND, USUAL_NIS), 0, RULES).trusted
