@@ -100,7 +100,7 @@ def doubted_guests(senders: SenderRecords, now_ns: int) -> list[str]:
     proven them right, and another guest was in quarantine or contradicted this robot of late. A
     guest that was caught can come back under another name: all unknown ones are one party."""
     new = [n for n, r in senders.items() if r.is_guest and r.confirmed < LEAST_CONFIRMED]
-    team = _team_heard(senders, now_ns) if new else set()
+    team = _team_recent_count(senders, now_ns) if new else set()
     is_doubt = bool(team) and any(
         r.reason or any(rival.name in team for rival in r.rivals)
         for r in senders.values()
@@ -115,11 +115,11 @@ def is_left_out_guest(senders: SenderRecords, name: str, now_ns: int) -> bool:
     record = senders[name]
     if not record.is_guest or record.confirmed >= LEAST_CONFIRMED:
         return False
-    contradicts_now = record.score > 0.0 and bool(_team_heard(senders, now_ns))
+    contradicts_now = record.score > 0.0 and bool(_team_recent_count(senders, now_ns))
     return contradicts_now or name in doubted_guests(senders, now_ns)
 
 
-def _team_heard(senders: SenderRecords, now_ns: int) -> set[str]:
+def _team_recent_count(senders: SenderRecords, now_ns: int) -> set[str]:
     """The robots of the team out of quarantine that reported within the last ten seconds."""
     return {
         name
@@ -257,10 +257,10 @@ def _comparison_of(senders: SenderRecords, name: str, now_ns: int, of: int) -> C
     if record.offsets[of].stamp_ns != now_ns or mean is None or not mean.can_be_wrong:
         return None
     others = voting_means(senders, now_ns, name, of)
-    return _result(mean, others, _heard(senders, others, now_ns))
+    return _result(mean, others, _recent_count(senders, others, now_ns))
 
 
-def _heard(senders: SenderRecords, voting: Collection[str], now_ns: int) -> int:
+def _recent_count(senders: SenderRecords, voting: Collection[str], now_ns: int) -> int:
     """How many senders were heard lately, with those in quarantine and without guests that have no
     vote."""
     return sum(
@@ -329,7 +329,7 @@ def _contradicted(senders: SenderRecords, name: str, now_ns: int) -> tuple[Rival
         if mean is None or not mean.is_precise:
             continue
         means = {name: mean, **voting_means(senders, now_ns, name, of)}
-        heard = _heard(senders, means, now_ns)
+        heard = _recent_count(senders, means, now_ns)
         for other, its in means.items():
             if other == OWN_SENSORS or not contradicts(mean, its):
                 continue
