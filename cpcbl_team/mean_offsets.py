@@ -30,11 +30,16 @@ SLOW_COMMON_M: Final = 0.01
 the estimate, which differs between the times of their reports, the more the longer the mean."""
 CONFLICT: Final = 18.0
 """Two sources contradict each other beyond this chi-square (two degrees of freedom)."""
+CONFLICT_OF_MOST: Final = 36.0
+"""The same between own sensors and most senders, if these say the same: it is less likely that so
+many are wrong than that own sensors err by chance."""
 ALTERNATING_NS: Final = 200_000_000  # between two sources whose reports alternate
 USUAL: Final = 6.0  # 95 % of correct sources differ by less (chi-square, two degrees of freedom)
 LEAD: Final = 7.0
 """Of two that contradict each other one is clearly nearer to a third source by this difference of
 their chi-squares."""
+LEAD_ON_MOST: Final = 14.0
+"""The same if the other one says what most senders say."""
 NEARER: Final = 2.0
 """Of two senders one is probably nearer to the robot's own sensors by this difference of their
 chi-squares."""
@@ -318,27 +323,50 @@ def both(fast: Comparison, slow: Comparison) -> Comparison:
     )
 
 
-def compared_with_own_sensors(mean: MeanOffset, own: MeanOffset, others: Means) -> Comparison:
+def compared_with_own_sensors(
+    mean: MeanOffset, own: MeanOffset, others: Means, heard: int = 0
+) -> Comparison:
     """A sender beside the robot's own sensors, which outweigh any number of others. Where this one
     and another contradict each other, they decide by which of both is clearly nearer to theirs.
+    `heard`: how many senders were heard lately, with this one and those in quarantine.
 
     The bias of a sender is its distance from its doubters: own sensors that are sure, and every
     other sender that is not clearly farther from these. How many others agree with it does not
     matter. A contested sender is left out if a rival is nearer to the own sensors.
     """
     leads = [(other, lead(other, mean, own)) for other in others.values()]
-    rivals = [ahead for other, ahead in leads if contradicts(mean, other)]
+    friends, rivals = [], []
+    for other, ahead in leads:
+        if contradicts(mean, other):
+            rivals.append((other, ahead))
+        else:
+            friends.append(other)
     doubters = [other for other, ahead in leads if ahead >= -NEARER]
     is_sure = own.is_within(SURE_SIGMA_M)
     if is_sure:
         doubters.append(own)
     bias = max((bias_variance(mean, doubter) for doubter in doubters), default=0.0)
-    is_refuted = is_sure and disagreement(mean, own) > CONFLICT
-    if is_refuted or any(ahead > LEAD for ahead in rivals):
+    apart = disagreement(mean, own) if is_sure else 0.0
+    is_doubted = apart > CONFLICT
+    number = max(heard, len(others) + 1)
+
+    def is_of_most(like_it: int) -> bool:
+        """Whether it and so many others, which own sensors are against as well, are most of all."""
+        return like_it > 0 and 2 * (like_it + 1) > number
+
+    is_refuted = apart > CONFLICT_OF_MOST or (
+        is_doubted and not is_of_most(sum(disagreement(f, own) > USUAL for f in friends))
+    )
+    is_behind = any(
+        ahead > LEAD_ON_MOST
+        or (ahead > LEAD and not is_of_most(sum(contradicts(rival, f) for f in friends)))
+        for rival, ahead in rivals
+    )
+    if is_refuted or is_behind:
         return Comparison(bias, is_wrong=True)
-    is_contested = any(ahead >= -LEAD for ahead in rivals)
-    is_left_out = any(ahead > NEARER for ahead in rivals)
-    return Comparison(bias, False, is_contested, not is_contested, is_left_out)
+    is_contested = any(ahead >= -LEAD for _, ahead in rivals)
+    is_left_out = any(ahead > NEARER for _, ahead in rivals)
+    return Comparison(bias, False, is_contested, not (is_contested or is_doubted), is_left_out)
 
 
 def compared_with_majority(mean: MeanOffset, others: Means) -> Comparison:

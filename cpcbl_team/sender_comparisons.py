@@ -18,7 +18,9 @@ from cpcbl_team.mean_headings import NO_TURNS, FadingTurns, MeanTurn, contradict
 from cpcbl_team.mean_offsets import (
     ALTERNATING_NS,
     FAST,
+    NOTHING,
     SLOW,
+    USUAL,
     Comparison,
     MeanOffset,
     both,
@@ -26,6 +28,7 @@ from cpcbl_team.mean_offsets import (
     compared_with_own_sensors,
     contradicts,
     disagreement,
+    lead,
 )
 from cpcbl_team.sender_records import NEVER_NS, SILENCE_NS, Rival, SenderRecord
 
@@ -51,6 +54,34 @@ def senders_with_a_say(senders: SenderRecords, name: str, now_ns: int) -> Sender
     return {n: r for n, r in recent_senders(senders, now_ns) if n not in silenced}
 
 
+def supporters_of_estimate(
+    recent: SenderRecords,
+    dissenters: Collection[str],
+    claims: Collection[tuple[float, float]],
+    began_ns: int,
+) -> set[str]:
+    """The sources that agreed with the estimate since a dispute began, and not with the `claims` of
+    those that contradict it as well: offsets from the estimate, m."""
+    return {
+        name
+        for name, r in recent.items()
+        if name not in dissenters
+        and r.last_agreement_ns > max(began_ns, r.dispute_since_ns)
+        and _denies(r, claims)
+    }
+
+
+def _denies(record: SenderRecord, claims: Collection[tuple[float, float]]) -> bool:
+    """Whether the mean of a source is nearer to the estimate than to these offsets from it, by more
+    than usual noise. A source that is too vague to tell agrees with both sides of a dispute. (One
+    without a mean is believed by its single reports.)"""
+    mean = record.means[FAST]
+    if mean is None:
+        return True
+    estimate = MeanOffset(0.0, 0.0, NOTHING, stamp_ns=mean.stamp_ns)
+    return all(lead(estimate, estimate._replace(x=x, y=y), mean) > USUAL for x, y in claims)
+
+
 def members(senders: SenderRecords, names: Collection[str]) -> list[str]:
     """Those of them that are no guests."""
     return [name for name in names if not senders[name].is_guest]
@@ -69,7 +100,7 @@ def doubted_guests(senders: SenderRecords, now_ns: int) -> list[str]:
     proven them right, and another guest was in quarantine or contradicted this robot of late. A
     guest that was caught can come back under another name: all unknown ones are one party."""
     new = [n for n, r in senders.items() if r.is_guest and r.confirmed < LEAST_CONFIRMED]
-    team = _team_heard(senders, now_ns) if new else set()
+    team = _team_recent_count(senders, now_ns) if new else set()
     is_doubt = bool(team) and any(
         r.reason or any(rival.name in team for rival in r.rivals)
         for r in senders.values()
@@ -84,11 +115,11 @@ def is_left_out_guest(senders: SenderRecords, name: str, now_ns: int) -> bool:
     record = senders[name]
     if not record.is_guest or record.confirmed >= LEAST_CONFIRMED:
         return False
-    contradicts_now = record.score > 0.0 and bool(_team_heard(senders, now_ns))
+    contradicts_now = record.score > 0.0 and bool(_team_recent_count(senders, now_ns))
     return contradicts_now or name in doubted_guests(senders, now_ns)
 
 
-def _team_heard(senders: SenderRecords, now_ns: int) -> set[str]:
+def _team_recent_count(senders: SenderRecords, now_ns: int) -> set[str]:
     """The robots of the team out of quarantine that reported within the last ten seconds."""
     return {
         name
@@ -225,16 +256,27 @@ def _comparison_of(senders: SenderRecords, name: str, now_ns: int, of: int) -> C
     record, mean = senders[name], senders[name].means[of]
     if record.offsets[of].stamp_ns != now_ns or mean is None or not mean.can_be_wrong:
         return None
-    return _result(mean, voting_means(senders, now_ns, name, of))
+    others = voting_means(senders, now_ns, name, of)
+    return _result(mean, others, _recent_count(senders, others, now_ns))
 
 
-def _result(mean: MeanOffset, others: Mapping[str, MeanOffset]) -> Comparison:
+def _recent_count(senders: SenderRecords, voting: Collection[str], now_ns: int) -> int:
+    """How many senders were heard lately, with those in quarantine and without guests that have no
+    vote."""
+    return sum(
+        now_ns - r.last_report_ns <= SILENCE_NS and (name in voting or not r.is_guest)
+        for name, r in senders.items()
+        if name != OWN_SENSORS
+    )
+
+
+def _result(mean: MeanOffset, others: Mapping[str, MeanOffset], heard: int) -> Comparison:
     """What the others say of a sender's mean: the robot's own sensors, or else the majority."""
     own = others.get(OWN_SENSORS)
     if own is None:
         return compared_with_majority(mean, others)
-    senders = {name: other for name, other in others.items() if name != OWN_SENSORS}
-    return compared_with_own_sensors(mean, own, senders)
+    of_senders = {name: other for name, other in others.items() if name != OWN_SENSORS}
+    return compared_with_own_sensors(mean, own, of_senders, heard)
 
 
 def wrong_turn(senders: SenderRecords, name: str, now_ns: int) -> MeanTurn | None:
@@ -287,9 +329,10 @@ def _contradicted(senders: SenderRecords, name: str, now_ns: int) -> tuple[Rival
         if mean is None or not mean.is_precise:
             continue
         means = {name: mean, **voting_means(senders, now_ns, name, of)}
+        heard = _recent_count(senders, means, now_ns)
         for other, its in means.items():
             if other == OWN_SENSORS or not contradicts(mean, its):
                 continue
-            if not _result(its, {n: m for n, m in means.items() if n != other}).is_wrong:
+            if not _result(its, {n: m for n, m in means.items() if n != other}, heard).is_wrong:
                 found[other] = Rival(other, its.x - mean.x, its.y - mean.y)
     return tuple(found.values())

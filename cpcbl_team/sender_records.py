@@ -37,7 +37,7 @@ OUTLIER_NIS = 30.0  # a report beyond has no part in the mean: test 1 takes care
 MOST_NIS = 20.0  # one report counts for no more than this
 JUMP_SIGMAS = 5.0  # a reported distance conflicts with odometry if it is longer by this,
 FROZEN_SIGMAS, FROZEN_SHARE = 3.0, 0.3  # or shorter by this and below this share of odometry's
-SLIP_SHARE, SLIP_M = 0.1, 0.03  # sigma of a distance by odometry: a share of it, and a constant
+SLIP_SHARE, SLIP_M = 0.1, 0.03  # least sigma of a distance by odometry: a share, and a constant
 LAST_OFFSET_SHARE = 0.2  # with which the last offset counts in their mean and variance
 LEAST_DISTANCE_M = 0.3  # the shortest distance that shows whether a sender follows the robot
 LONGEST_COMPARISON_NS = 5_000_000_000  # after this time without a jump any distance is a comparison
@@ -68,6 +68,8 @@ class ReportedPosition(NamedTuple):
     variance: float  # m^2, mean of the axes
     odometry_from_robot: Pose2
     turn_rad: float = 0.0  # the heading of the estimate minus that of odometry
+    odometry_m2_per_m: float = 0.0  # variance of a distance by odometry per metre, by its settings,
+    odometry_share: float = 0.0  # and the sigma of its scale
 
 
 class OffsetEvidence(NamedTuple):
@@ -266,11 +268,12 @@ def is_in_conflict(record: SenderRecord, began_ns: int) -> bool:
 
 def distances_between(then: ReportedPosition, now: ReportedPosition) -> tuple[float, float, float]:
     """The distance between two reported positions, that by odometry, and the sigma of their
-    difference (m)."""
+    difference (m): wheels that are known to be noisy contradict nobody by that noise."""
     displacement = then.odometry_from_robot.inverse() @ now.odometry_from_robot
     driven = math.hypot(displacement.x, displacement.y)
-    slip = SLIP_SHARE * driven + SLIP_M
-    sigma = math.sqrt(then.variance + now.variance + slip * slip)
+    slip, scale = SLIP_SHARE * driven + SLIP_M, now.odometry_share * driven
+    of_odometry = slip * slip + now.odometry_m2_per_m * driven + scale * scale
+    sigma = math.sqrt(then.variance + now.variance + of_odometry)
     return math.hypot(now.x - then.x, now.y - then.y), driven, sigma
 
 

@@ -69,6 +69,8 @@ class TeammateScreen:
         self._collaboration, self._rules = settings.collaboration, settings.collaboration.trust
         self._localizer_rules = settings.localizer
         self._gates = gates
+        o = settings.odometry
+        self._odometry_errors = o.distance_sigma_m_per_sqrt_m**2, o.distance_scale_sigma
         self.is_active = self._rules.enabled and is_probabilistic
 
     def has_recent_reports(self, state: State, now_ns: int) -> bool:
@@ -225,7 +227,7 @@ class TeammateScreen:
             now,
             None if is_lost else nis,
             (ex, ey),
-            ReportedPosition(*where),
+            ReportedPosition(*where, *self._odometry_errors),
             _evidence_at(state, position.information(position.noise(0.0)), position.dependent),
             self._is_guest(observation.sender),
             of_heading,

@@ -35,6 +35,7 @@ from cpcbl_team.sender_comparisons import (
     recent_senders,
     rival_of,
     senders_with_a_say,
+    supporters_of_estimate,
     votes,
     voting_means,
     with_comparison,
@@ -190,18 +191,15 @@ def _decide_dispute(
         return TrustDecision(senders, True)
     began_ns = min(disputes_ns)
     dissenters = {n for n, r in recent.items() if r.score > 0.5 * rules.limit}
-    supporters = {
-        n
-        for n, r in recent.items()
-        if n not in dissenters and r.last_agreement_ns > max(began_ns, r.dispute_since_ns)
-    }
+    claims = [r.mean_offset for r in recent.values() if r.score > rules.limit]
+    supporters = supporters_of_estimate(recent, dissenters, claims, began_ns)
     if not supporters:
         return TrustDecision(senders, True)
-    if OWN_SENSORS not in dissenters | supporters:
-        if any(r.name in supporters for n in dissenters for r in open_rivals(senders, n)):
-            return TrustDecision(senders, True)
-        if not members(recent, supporters) and len(members(recent, dissenters)) == 1:
-            return _without_decision(TrustDecision(senders, True), dissenters, now_ns)
+    if any(r.name in supporters for n in dissenters for r in open_rivals(senders, n)):
+        return TrustDecision(senders, True)
+    is_only_of_team = not members(recent, supporters) and len(members(recent, dissenters)) == 1
+    if is_only_of_team and OWN_SENSORS not in dissenters | supporters:
+        return _without_decision(TrustDecision(senders, True), dissenters, now_ns)
     is_right = _is_estimate_right(recent, dissenters, supporters, began_ns, now_ns)
     if is_right is None:
         return TrustDecision(senders, False)

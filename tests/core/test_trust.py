@@ -8,9 +8,11 @@ from msgspec.structs import replace
 from support.core import (
     SECOND,
 )
-from support.trust import AGREES, CONTRADICTS, RULES, Receiver
+from support.trust import AGREES, CONTRADICTS, MS, RULES, Receiver
 
 from cpcbl_team.estimate import Covariance3
+from cpcbl_team.gaussian import Covariance2
+from cpcbl_team.mean_offsets import MeanOffset
 from cpcbl_team.sender_comparisons import OWN_SENSORS, contest_m
 from cpcbl_team.sender_records import (
     USUAL_NIS,
@@ -193,6 +195,35 @@ def test_a_sender_that_is_only_suspected_is_not_used_and_not_quarantined() -> No
     assert suspected.quarantined == frozenset()
     found = assess(senders, "west", TeammateReport(10 * SECOND, CONTRADICTS), 0, RULES)
     assert found.quarantined == {"west"}
+
+
+@pytest.mark.parametrize(("sigma_m", "is_right"), [(0.01, True), (0.04, False)])
+def test_one_that_is_too_vague_to_tell_supports_no_side_of_a_dispute(
+    sigma_m: float, is_right: bool
+) -> None:
+    """The estimate followed a liar. A correct sender contradicted it, a vague one agreed with both
+    and was the liar's majority: the correct one was in quarantine for 16 s."""
+    senders = disputed(honest=1.2, liar=0.0, vague=0.0)
+    senders["honest"] = replace(senders["honest"], mean_offset=(0.08, 0.0))
+    for name, sigma in (("liar", 0.01), ("vague", sigma_m)):
+        mean = MeanOffset(0.01, 0.0, Covariance2(sigma * sigma, 0.0, sigma * sigma))
+        senders[name] = replace(senders[name], means=(mean, None))
+    report = TeammateReport(10 * SECOND, CONTRADICTS, (0.08, 0.0))
+    since = replace(senders["honest"], dispute_since_ns=10 * SECOND - 2 * MS)  # a tie lasts longer
+    decision = assess({**senders, "honest": since}, "honest", report, 0, RULES)
+    assert bool(decision.quarantined) is is_right
+
+
+@pytest.mark.parametrize("is_contest", [True, False])
+def test_single_readings_of_own_sensors_end_no_contest(is_contest: bool) -> None:
+    """Their mean does that: each reading alone agrees with both sides."""
+    senders = disputed(honest=1.2, liar=0.0, **{OWN_SENSORS: 0.0})
+    if is_contest:
+        for name, rival in (("honest", "liar"), ("liar", "honest")):
+            senders[name] = replace(senders[name], rivals=(Rival(rival, 0.1, 0.0),))
+    report = TeammateReport(10 * SECOND, CONTRADICTS, (0.1, 0.0))
+    decision = assess(senders, "honest", report, 0, RULES)
+    assert bool(decision.quarantined) is not is_contest
 
 
 def test_a_sender_below_the_limit_is_used_while_nobody_is_above_it() -> None:
