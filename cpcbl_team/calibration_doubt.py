@@ -29,6 +29,8 @@ from cpcbl_team.estimate import (
     pose_chi_square,
     pose_difference,
 )
+from cpcbl_team.filter_corrections import NOT_ESTIMATED, Estimated
+from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.geometry import Pose2
 from cpcbl_team.miscalibration import Adaptation
 from cpcbl_team.range_errors import NO_RANGE_ERRORS
@@ -49,18 +51,18 @@ def with_probabilities(
     present: Adaptation,
     estimate: Estimate,
     place: Pose2,
-    scales_are_considered: bool = False,
+    estimated: Estimated = NOT_ESTIMATED,
 ) -> tuple[CalibrationFilter, ...]:
     """The filters that know how likely it is that the settings are wrong in the way in which each
     of them says. `present`: what of the settings is corrected already. Where they agree about
     another pose than the robot's own `estimate` (at `place` by odometry), one of both is wrong, and
     nothing says which: either the settings are, or the robot is elsewhere than it was led.
-    `scales_are_considered`: wrong scales of the odometry are in the estimate's covariance."""
+    `estimated`: which errors are in the covariance of the `estimate`."""
     share = 1.0 / max(len(filters), 1)
     if _contradict(filters, estimate, place):
         odds = [share for _ in filters]
     else:
-        odds = [share * ODDS * _ratio(f, present, scales_are_considered) for f in filters]
+        odds = [share * ODDS * _ratio(f, present, estimated) for f in filters]
     every = sum(odds)
     k = 1.0 / (1.0 + every) if every > LEAST else 0.0
     return tuple([f._replace(probability=k * o) for f, o in zip(filters, odds, strict=True)])
@@ -106,7 +108,7 @@ def scale_variances(filters: Filters, first: ScaleErrors) -> tuple[float, float]
     """The mean squares of the errors of the distance's and the turn's scale that these filters know
     of, about the present scales; `first`: as it is without filters."""
     if not filters:
-        return first.distance, first.turn
+        return first.first
     distance, turn = [
         fmean([e * e + CHORD_FACTOR * s * s for e, s in [f.error(place) for f in filters]])
         for place in (DISTANCE, TURN)
@@ -138,10 +140,10 @@ def _are_apart(one: Estimate, other: Estimate) -> bool:
     return pose_chi_square(one, other) > CONTRADICTION
 
 
-def _ratio(f: CalibrationFilter, present: Adaptation, scales_are_considered: bool) -> float:
+def _ratio(f: CalibrationFilter, present: Adaptation, estimated: Estimated) -> float:
     """How much likelier the sightings are with a bias of bearings, with that and wrong ranges, or
     with a wrong scale of the odometry, than with the settings as they are; what speaks for these
-    does not count."""
+    does not count. Of errors that its own filter estimates only the others are compared."""
     found, first = f.errors, FIRST_SIGMAS
     errors = (
         found[0] - present.bearing_bias_rad,
@@ -151,16 +153,28 @@ def _ratio(f: CalibrationFilter, present: Adaptation, scales_are_considered: boo
     covariance = _sensor_covariance(f.covariance).scaled(f.scatter)
     if min(covariance.xx, covariance.yy, covariance.hh) <= 0.0:
         return 0.0
-    ratios = [_single_ratio(errors[0], covariance.xx, first[0])]
-    for place in () if scales_are_considered else (DISTANCE, TURN):
+    ratios = [0.0 if estimated.bearing_bias else _single_ratio(errors[0], covariance.xx, first[0])]
+    for place in () if estimated.scales else (DISTANCE, TURN):
         error, sigma = f.error(place)
         variance = CHORD_FACTOR * sigma * sigma
         ratios.append(_single_ratio(error, variance, first[place - BEARING]))
-    if not _is_singular(covariance):
+    if estimated.bearing_bias:
+        ratios.append(_ranges_ratio(errors[1:], covariance))
+    elif not _is_singular(covariance):
         chi_square = dot(errors, covariance.inverse().times(errors))
         shrunk = covariance.determinant() / (first[0] * first[1] * first[2]) ** 2
         ratios.append(_density_ratio(chi_square, shrunk))
     return sum([max(ratio - 1.0, 0.0) for ratio in ratios])
+
+
+def _ranges_ratio(errors: tuple[float, float], covariance: Covariance3) -> float:
+    """That of both errors of ranges alone. `covariance`: of the errors of the sensor."""
+    _, of_share, of_offset, *_ = FIRST_SIGMAS
+    ranges = Covariance2(covariance.yy, covariance.yh, covariance.hh)
+    if ranges.determinant() <= LEAST_INDEPENDENT * ranges.xx * ranges.yy:
+        return 0.0
+    shrunk = ranges.determinant() / (of_share * of_offset) ** 2
+    return _density_ratio(ranges.mahalanobis_squared(*errors), shrunk)
 
 
 def _single_ratio(error: float, variance: float, first_sigma: float) -> float:

@@ -23,7 +23,7 @@ from types import MappingProxyType
 from typing import Final, NamedTuple
 
 from cpcbl_team.config import OdometryNoise
-from cpcbl_team.estimate import ZERO3, Covariance3, Estimate, Six
+from cpcbl_team.estimate import ZERO3, Covariance3, Estimate, Row, Six
 from cpcbl_team.geometry import Pose2, new, wrap_angle
 from cpcbl_team.motion import covariance_after, distance_variance, turn_variance
 from cpcbl_team.range_errors import RangeErrors
@@ -92,6 +92,7 @@ class CalibrationFilter(NamedTuple):
     rejected: int = 0  # in a row
     probability: float = 0.0  # that the settings are wrong as it says (`calibration_doubt.py`)
     gaps: int = 0  # in the odometry, before the way on which it was led here
+    scales: tuple[float, float] = (1.0, 1.0)  # by which the odometry was corrected then
 
     @staticmethod
     def at(
@@ -185,11 +186,25 @@ class CalibrationFilter(NamedTuple):
         shared = covariance if any(before.shared) else before.shared
         return Estimate(pose, covariance, shared)
 
+    @property
+    def bearing_bias(self) -> tuple[float, float, Row]:
+        """What bearings are too large by (rad), its variance, and its covariance with the pose."""
+        k, row = self.scatter, self.covariance[BEARING]
+        return self.errors[0], k * row[BEARING], (k * row[0], k * row[1], k * row[2])
+
     def with_scales(self, distance: float, turn: float) -> "CalibrationFilter":
         """For odometry that is corrected by these shares more than before."""
         bearing, share, offset, by_distance, by_turn = self.errors
         errors = bearing, share, offset, by_distance - distance, by_turn - turn
         return self._replace(errors=errors)
+
+    def for_scales(self, distance: float, turn: float) -> "CalibrationFilter":
+        """For odometry that is corrected by these scales from now on."""
+        before, before_turn = self.scales
+        if distance == before and turn == before_turn:
+            return self
+        changed = self.with_scales(distance / before - 1.0, turn / before_turn - 1.0)
+        return changed._replace(scales=(distance, turn))
 
 
 class _Update:
@@ -202,7 +217,7 @@ class _Update:
         self._used_ns = dict(before.used_ns)
         self._chi_squares, self._readings = before.chi_squares, before.readings
         self._used, self._metres, self._rejected = before.used, before.metres, before.rejected
-        self._gaps = before.gaps
+        self._gaps, self._scales = before.gaps, before.scales
 
     def move(self, stamp_ns: int, place: Pose2, noise: OdometryNoise) -> None:
         """To where the odometry has led by this time: pose' = pose + arc(errors)."""
@@ -313,7 +328,7 @@ class _Update:
         parts = (
             self._stamp_ns, self._place, new(Pose2, (x, y, wrap_angle(heading))), tuple(errors),
             _tuples(self._rows), self._used_ns, self._chi_squares, self._readings, self._used,
-            self._metres, self._rejected, 0.0, self._gaps,
+            self._metres, self._rejected, 0.0, self._gaps, self._scales,
         )  # fmt: skip
         return new(CalibrationFilter, parts)
 

@@ -41,12 +41,19 @@ class CalibrationMemory(NamedTuple):
     @property
     def corrected(self) -> SelfCalibration:
         """All that the robot knows of the scales of its odometry and the bias of its bearings."""
-        adapted = self.adaptation
-        return self.learned._replace(
-            distance_scale=self.learned.distance_scale * adapted.distance_scale,
-            turn_scale=self.learned.turn_scale * adapted.turn_scale,
-            bearing_bias_rad=self.bearing_bias_rad,
+        known, adapted = self.learned, self.adaptation
+        by_distance, by_turn = self.scales.distance.factor, self.scales.turn.factor
+        return known._replace(
+            distance_scale=known.distance_scale * adapted.distance_scale * by_distance,
+            turn_scale=known.turn_scale * adapted.turn_scale * by_turn,
+            bearing_bias_rad=self.bearing_bias_rad + self._estimated_bias_rad,
         )
+
+    @property
+    def _estimated_bias_rad(self) -> float:
+        """What the robot estimates with its pose of the bias of its bearings."""
+        common = self.common
+        return common.errors.yaw_rad if common is not None and common.is_of_bearings else 0.0
 
     def misplaced(self, stamp_ns: int) -> str:
         """The object that must stand elsewhere than on the map; empty if there is none."""

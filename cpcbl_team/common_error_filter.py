@@ -45,6 +45,7 @@ from cpcbl_team.state import (
 )
 
 LATEST, LEAST_ACCEPTED = 8, 3
+MOST_SIGMAS = 3.0  # of a bias of bearings: what is more is another error, such as wrong ranges
 _ZERO_ROW: Row = (0.0, 0.0, 0.0)
 _UNAFFECTED: tuple[Sensitivity, Sensitivity] = ((), ())
 
@@ -73,16 +74,29 @@ def camera_sigmas(camera: CameraSettings) -> CameraErrors:
     return CameraErrors(math.radians(camera.yaw_sigma_deg), camera.focal_share, camera.centre_share)
 
 
+def prior_errors(settings: LocalizationSettings, camera: CameraSettings | None) -> CommonErrors:
+    """What is known of a robot's sensor before it has seen anything: the sigmas of its errors. A
+    sensor that is no camera of the robot's own is turned like one whose yaw is wrong. A robot that
+    calibrates itself learns that bias by its motion."""
+    if camera is not None:
+        return CommonErrors.of_camera(math.radians(camera.yaw_deg), camera_sigmas(camera))
+    sigma_deg = 0.0 if settings.localizer.learns else settings.sensor.bearing_bias_sigma_deg
+    return CommonErrors.of_camera(0.0, CameraErrors(math.radians(sigma_deg)))
+
+
 def common_error_filter(
     settings: LocalizationSettings, field: Field, camera: CameraSettings | None
 ) -> "CommonErrorFilter | None":
     """The filter's part for errors that sightings have in common; None where there are none, or
     where they are not kept apart."""
-    if camera is not None and not considers_camera(settings, camera):
-        camera = None
-    if camera is None and (field.is_exact or not considers_common_errors(settings)):
+    if not considers_common_errors(settings):
         return None
-    return CommonErrorFilter(settings, field, camera)
+    prior = prior_errors(settings, camera)
+    is_exact = prior.camera_sigmas == NO_ERRORS
+    if is_exact and field.is_exact:
+        return None
+    learns = not is_exact and (camera is None or camera.self_calibration)
+    return CommonErrorFilter(settings, field, prior, learns)
 
 
 def common_errors_of(state: State) -> CommonErrors:
@@ -97,15 +111,17 @@ class CommonErrorFilter:
     its pose."""
 
     def __init__(
-        self, settings: LocalizationSettings, field: Field, camera: CameraSettings | None
+        self,
+        settings: LocalizationSettings,
+        field: Field,
+        prior: CommonErrors,
+        learns_camera: bool,
     ) -> None:
+        """`prior`: what the settings say of the errors of the sensor; `learns_camera`: whether
+        these are estimated, not only considered."""
         self._field, self._sensor, self._noise = field, settings.sensor, settings.odometry
-        self._learns_camera = camera is not None and camera.self_calibration
         self._splits = settings.collaboration.fusion == "split-ci"
-        self.prior = CommonErrors.of_camera(0.0, NO_ERRORS)
-        if camera is not None:
-            axis = math.radians(camera.yaw_deg)
-            self.prior = CommonErrors.of_camera(axis, camera_sigmas(camera))
+        self.prior, self._learns_camera = prior, learns_camera
 
     def started(self, state: State) -> State:
         """The state in which nothing but the settings and the map is known."""
@@ -209,6 +225,8 @@ class CommonErrorFilter:
         estimate = prior
         if readings:
             estimate, common = updated(prior, common, readings, self._learns_camera)
+            if common.is_of_bearings:
+                common = common.with_bias_below(MOST_SIGMAS * self.prior.camera_sigmas.yaw_rad)
         for found in accepted:
             m = found.measurement
             if not m.sender:

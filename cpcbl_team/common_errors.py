@@ -76,6 +76,12 @@ class CommonErrors(NamedTuple):
         return reading_variances(self.parameters.covariance, bearing_rad - self.axis_rad)
 
     @property
+    def is_of_bearings(self) -> bool:
+        """Whether nothing but a bias of bearings may be wrong."""
+        yaw, focal, centre = self.camera_sigmas
+        return yaw > 0.0 == focal == centre and not self.objects
+
+    @property
     def is_precise(self) -> bool:
         """Whether they are known well enough not to matter beside other errors."""
         places = (max(self.place_covariance(name)[::2]) for name in self.objects)
@@ -148,6 +154,22 @@ class CommonErrors(NamedTuple):
         """The sighting without the errors of the camera that are known."""
         return without_errors(sighting, self.errors, self.axis_rad)
 
+    def with_bearing_bias(self, bias_rad: float, variance: float, with_pose: Row) -> "CommonErrors":
+        """With a bias of bearings that was found together with the pose. `with_pose`: its
+        covariance with (x, y, heading)."""
+        (_, *rows), (_, *others) = self.parameters
+        first = (variance, *[0.0 for _ in rows])
+        rest = [(0.0, *row[1:]) for row in rows]
+        parameters = Parameters((first, *rest), (with_pose, *others))
+        return self._replace(values=(bias_rad, *self.values[1:]), parameters=parameters)
+
+    def with_bias_below(self, most_rad: float) -> "CommonErrors":
+        """With a bias of bearings that is at most so large."""
+        bias_rad, *others = self.values
+        if -most_rad <= bias_rad <= most_rad:
+            return self
+        return self._replace(values=(math.copysign(most_rad, bias_rad), *others))
+
     def uncorrelated(self) -> "CommonErrors":
         """For a robot that has found its pose anew."""
         return self._replace(parameters=self.parameters.uncorrelated())
@@ -169,6 +191,8 @@ class CommonErrors(NamedTuple):
         rows = list(covariance)
         for i, drift in enumerate(DRIFT):
             row = rows[i]
+            if row[i] == 0.0:  # stated to be exact
+                continue
             rows[i] = (*row[:i], row[i] + drift * seconds, *row[i + 1 :])
         return self._replace(parameters=Parameters(tuple(rows), with_pose))
 

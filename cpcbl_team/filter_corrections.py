@@ -8,7 +8,7 @@ import math
 from collections.abc import Sequence
 from math import sqrt
 from statistics import fmean
-from typing import Final
+from typing import Final, NamedTuple
 
 from cpcbl_team.calibration_filter import BEARING, DISTANCE, TURN, Filters
 from cpcbl_team.miscalibration import LEAST_BIAS_RAD, MOST_BIAS_RAD, Adaptation
@@ -33,21 +33,43 @@ ALIKE: Final = 0.5  # by less than this part of it what one filter finds differs
 SETTLED_RAD: Final = math.radians(1.0)  # sigma of a bias that is known
 
 
+class Estimated(NamedTuple):
+    """Which errors of the settings are states of the robot's own filter."""
+
+    scales: bool  # those of the odometry
+    bearing_bias: bool
+
+
+NOT_ESTIMATED: Final = Estimated(False, False)
+
+
 def correction(
-    filters: Filters, present: Adaptation, sigmas_of_scale: float = SIGMAS_OF_SCALE
+    filters: Filters,
+    present: Adaptation,
+    estimated: Estimated = NOT_ESTIMATED,
+    are_doubtful: bool = False,
 ) -> Adaptation | None:
     """The settings with the errors that are clear to each filter, and large enough to be worth it;
-    None if that changes nothing. What is corrected already follows what is known."""
+    None if that changes nothing. What is corrected already follows what is known.
+    `estimated`: which errors the robot's own filter estimates; `are_doubtful`: whether the settings
+    say that the scales of the odometry may be wrong."""
     if any(f.used < FEWEST_USED or len(f.used_ns) < LEAST_LANDMARKS for f in filters):
         return None
     # Of few sightings it must be clearer, for what they err by together is hardly known
     k = max(1.0, LEAST_USED / min([f.used for f in filters]))
     ranges = _range_errors(filters, present.ranges, k)
     are_new = present.ranges == NO_RANGE_ERRORS != ranges  # what was found with wrong ones is void
-    bias_rad = _bearing_bias(filters, 0.0 if are_new else present.bearing_bias_rad, k)
+    bias_rad = present.bearing_bias_rad
+    if not estimated.bearing_bias:
+        bias_rad = _bearing_bias(filters, 0.0 if are_new else bias_rad, k)
+    distance_scale, turn_scale = present.distance_scale, present.turn_scale
+    if not estimated.scales:
+        sigmas = SIGMAS_OF_DOUBTFUL if are_doubtful else SIGMAS_OF_SCALE
+        distance_scale = _scale(filters, DISTANCE, distance_scale, sigmas, k)
+        turn_scale = _scale(filters, TURN, turn_scale, sigmas, k)
     changed = present._replace(
-        distance_scale=_scale(filters, DISTANCE, present.distance_scale, sigmas_of_scale, k),
-        turn_scale=_scale(filters, TURN, present.turn_scale, sigmas_of_scale, k),
+        distance_scale=distance_scale,
+        turn_scale=turn_scale,
         bearing_bias_rad=bias_rad,
         ranges=ranges,
     )

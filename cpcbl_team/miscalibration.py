@@ -230,13 +230,13 @@ class Rules(NamedTuple):
     knows_covariance: bool = True
     """Whether the covariance is that of the errors. Where it is only larger (`circular`), the size
     of corrections tells nothing, and a constant error must be clearer."""
+    finds_scales: bool = True  # else they are states beside the pose (`scale_errors.py`)
 
 
 def adapted(
     check: ModelCheck, present: Adaptation, accepted: int, rules: Rules
 ) -> Adaptation | None:
-    """What the settings should be changed to; None if they fit. So many observations have been
-    `accepted` since the start."""
+    """What the settings should be changed to; None if they fit. `accepted`: since the start."""
     evidence = check.evidence
     if evidence.parts < LEAST_PARTS:
         return None
@@ -265,6 +265,7 @@ def _with_errors(present: Adaptation, fit: Fit, rules: Rules) -> Adaptation | No
     """The adaptation without the constant errors, where one of them is clear."""
     (distance, turn, bias), sigmas, _ = fit
     of_distance, of_turn, of_bias = (s / math.sqrt(rules.independent_share) for s in sigmas)
+    distance, turn = (distance, turn) if rules.finds_scales else (0.0, 0.0)
     clear = max(abs(distance) / of_distance, abs(turn) / of_turn, abs(bias) / of_bias)
     is_first = errors_between(AS_CONFIGURED, present) == NO_ERRORS
     first = SIGMAS if rules.knows_covariance else SIGMAS_OF_CIRCLE

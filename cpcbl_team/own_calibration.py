@@ -12,8 +12,10 @@ from cpcbl_team.calibration_filter import (
     STRIDE_NS,
 )
 from cpcbl_team.calibration_memory import CalibrationMemory
+from cpcbl_team.common_errors import CommonErrors
 from cpcbl_team.config import Field, LocalizationSettings, OdometryNoise
 from cpcbl_team.constant_errors import NO_ERRORS, NO_EVIDENCE
+from cpcbl_team.estimate import POSE, offset_pose
 from cpcbl_team.geometry import new
 from cpcbl_team.landmarks import Landmarks, LandmarkUpdate
 from cpcbl_team.map_residuals import ResidualSums
@@ -37,12 +39,18 @@ from cpcbl_team.miscalibration import (
 )
 from cpcbl_team.motion import NO_VARIANCE, MotionVariance, distance_variance, turn_variance
 from cpcbl_team.recovery_evidence import SPACING_NS
-from cpcbl_team.second_filters import SecondFilters, with_adaptation
+from cpcbl_team.scale_errors import NO_OFFSET, ScaleErrors
+from cpcbl_team.second_filters import SecondFilters, has_second_filters, with_adaptation
 from cpcbl_team.self_calibration import ReferencePose, ReferencePoses, self_calibrate
 from cpcbl_team.state import (
     State,
     with_calibration,
 )
+
+
+def is_precise(common: CommonErrors | None) -> bool:
+    """Whether the errors that sightings have in common do not matter beside others."""
+    return common is None or common.is_precise
 
 
 class OwnCalibration:
@@ -64,34 +72,56 @@ class OwnCalibration:
             rules.gate_probability,
             independent_share=block_s / (block_s + 2.0 * correlation_s),
             knows_covariance=rules.variant != "circular",
+            finds_scales=self.filters.scales.are_exact or not self.filters.estimates_scales,
         )
         self._independent_frames = spacing_s / (spacing_s + 2.0 * correlation_s)
 
     def started(self, state: State) -> State:
         """The state at the start: the scales of the odometry are known as the settings have it."""
         scales, memory = self.filters.scales, state.memory.calibration
-        if not scales.are_considered:
+        if scales.are_exact:
             return state
         if self._learns:
             learned = memory.learned._replace(
-                distance_variance=scales.distance, turn_variance=scales.turn
+                distance_variance=scales.first[0], turn_variance=scales.first[1]
             )
             memory = memory._replace(learned=learned)
         return with_calibration(state, memory._replace(scales=scales))
 
     def is_known(self, state: State) -> bool:
         """Whether the robot knows anything of its calibration that its settings do not say."""
-        return self._learns or state.memory.calibration.adaptation is not AS_CONFIGURED
+        memory = state.memory.calibration
+        is_adapted = memory.adaptation is not AS_CONFIGURED
+        return is_adapted or self._learns or not memory.scales.are_exact
 
     def corrected_motion(
         self, state: State, distance: float, turn: float
     ) -> tuple[State, float, float]:
-        """A motion by the scales that are known, and the state that counts its turn."""
+        """A motion by the scales that are known, and the state that counts its turn. What updates
+        since the last motion say of the scales is known then."""
         memory = state.memory.calibration
+        scales = memory.scales
+        if not scales.are_exact:
+            state, scales = self._scales_after_updates(state)
+            distance *= scales.distance.factor
+            turn *= scales.turn.factor
         distance *= memory.learned.distance_scale * memory.adaptation.distance_scale
         turn *= memory.learned.turn_scale * memory.adaptation.turn_scale
-        memory = memory._replace(total_turn_rad=memory.total_turn_rad + turn)
+        memory = memory._replace(total_turn_rad=memory.total_turn_rad + turn, scales=scales)
         return with_calibration(state, memory), distance, turn
+
+    def _scales_after_updates(self, state: State) -> tuple[State, ScaleErrors]:
+        """What is known of the scales of the odometry after the updates since the last motion; and
+        the state at the pose without the errors of these that are clear now."""
+        scales, estimate = state.memory.calibration.scales, state.estimate
+        if state.lost:
+            return state, scales.at_new_pose()
+        known = scales.after_updates(estimate, self.filters.estimates_scales)
+        known, offset = known.corrected()
+        if offset != NO_OFFSET:
+            estimate = estimate._replace(pose=offset_pose(estimate.pose, offset, POSE))
+            state = state._replace(estimate=estimate)
+        return state, known
 
     def extra_variance(
         self, state: State, distance: float, turn: float, crawl_s: float
@@ -132,8 +162,8 @@ class OwnCalibration:
         now_ns, _, place, _, _, _, memory = state
         _, _, calibration, _ = memory
         _, _, _, check, present, _, _, common, *_ = calibration
-        if common is not None and not common.is_precise:
-            return state  # corrections of the pose tell of the camera
+        if not (has_second_filters(common) or is_precise(common)):
+            return state
         begin, _, _, _, _, _, _, _, path_ns = check
         if begin is None or now_ns - begin.stamp_ns >= BLOCK_NS:
             return self._after_check(self.filters.after_block(self._with_residuals(state)))
@@ -192,7 +222,11 @@ class OwnCalibration:
         else:
             known, references = self_calibrate(memory.learned, memory.references, here, self._noise)
             memory = memory._replace(learned=known, references=references)
-        return self.filters.with_scales(with_calibration(state, memory))
+        scales = memory.scales
+        if not scales.are_exact:
+            learned = memory.learned
+            scales = scales.with_variances(learned.distance_variance, learned.turn_variance)
+        return with_calibration(state, memory._replace(scales=scales))
 
     def _after_check(self, state: State) -> State:
         """The state at the end of a block."""
@@ -210,6 +244,7 @@ class OwnCalibration:
             or memory.recovery.lost
             or odometry_until_ns < now_ns
             or memory.teammates.last_report_ns >= begin.stamp_ns
+            or not is_precise(known.common)  # corrections of the pose tell of the sensor
         ):
             check = check.from_pose(now)
         else:
@@ -225,7 +260,7 @@ class OwnCalibration:
         present = memory.adaptation
         changed = adapted(check, present, accepted, self._rules)
         doubts = doubts_of(check, present, changed or present, self._rules.independent_share)
-        if memory.scales.are_considered:  # those of odometry are in the estimate already
+        if not memory.scales.are_exact:  # those of odometry are in the estimate already
             doubts = 0.0, 0.0, doubts[2]
         check = check._replace(doubts=doubts)
         if changed is None:

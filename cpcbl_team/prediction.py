@@ -78,6 +78,7 @@ class Prediction:
             extra, own = NO_VARIANCE, self._calibration
             if own.is_known(state):
                 state, distance, turn = own.corrected_motion(state, distance, turn)
+                estimate = state.estimate
                 extra = own.extra_variance(state, distance, turn, crawl_s)
             if self._common is not None:
                 state = self._common.before_motion(state, distance, turn, seconds)
@@ -97,6 +98,7 @@ class Prediction:
         distance, turn, extra = bridge(before, following, from_s, gap_ns * 1e-9, self._odometry)
         if self._calibration.is_known(state):
             state, distance, turn = self._calibration.corrected_motion(state, distance, turn)
+            estimate = state.estimate
         if distance != 0.0 or turn != 0.0 or extra != NO_VARIANCE:
             if self._common is not None:
                 state = self._common.before_motion(state, distance, turn, 0.0)
@@ -117,13 +119,10 @@ class Prediction:
         before, memory = state.estimate, state.memory.calibration
         estimate = self._variant.move(before, distance, turn, crawl_s, extra)
         scales = memory.scales
-        if not scales.are_considered:
+        if scales.are_exact or state.lost:
             return state, estimate
-        if state.lost:
-            scales = scales.at_new_pose()
-        else:
-            scales, added = scales.after_motion(before.pose, before.covariance, distance, turn)
-            covariance = estimate.covariance.plus(added)
-            estimate = self._variant.reduce(estimate._replace(covariance=covariance))
-            scales = scales._replace(covariance=estimate.covariance)
+        scales, added = scales.after_motion(before, distance, turn)
+        covariance = estimate.covariance.plus(added)
+        estimate = self._variant.reduce(estimate._replace(covariance=covariance))
+        scales = scales._replace(estimate=estimate)
         return with_calibration(state, memory._replace(scales=scales)), estimate

@@ -20,10 +20,11 @@ from cpcbl_team.calibration_filter import (
     SeenLandmark,
 )
 from cpcbl_team.calibration_memory import CalibrationMemory
+from cpcbl_team.common_errors import CommonErrors
 from cpcbl_team.config import Field, LocalizationSettings
 from cpcbl_team.constant_errors import pose_offset
 from cpcbl_team.estimate import POSE, Estimate, offset_pose
-from cpcbl_team.filter_corrections import SIGMAS_OF_DOUBTFUL, SIGMAS_OF_SCALE, correction
+from cpcbl_team.filter_corrections import Estimated, correction
 from cpcbl_team.landmarks import Landmarks
 from cpcbl_team.lost_reasons import no_longer_lost
 from cpcbl_team.miscalibration import AS_CONFIGURED, Adaptation, ModelCheck, errors_between
@@ -36,6 +37,7 @@ from cpcbl_team.state import (
     State,
     at_new_pose,
     with_calibration,
+    with_common_errors,
     with_recovery,
 )
 
@@ -47,9 +49,10 @@ class SecondFilters:
     """Those of one robot."""
 
     def __init__(self, settings: LocalizationSettings, field: Field, landmarks: Landmarks) -> None:
-        odometry, self._learns = settings.odometry, settings.localizer.learns
+        odometry = settings.odometry
         self._landmarks, self._field, self._noise = landmarks, field, odometry
         self._correlation_s = settings.sensor.correlation_s
+        self._bearing_variance = settings.sensor.bearing_sigma_rad**2
         self._names_of_landmarks, names = frozenset(field.landmarks), sorted(field.landmarks)
         self._has_other_landmarks = len(field.names) > 2
         self._left_out = [
@@ -59,34 +62,34 @@ class SecondFilters:
         distance, turn = odometry.distance_scale_sigma, odometry.turn_scale_sigma
         rules = settings.localizer
         is_of_paper = rules.variant == "weighted" or rules.paper_uncertainty
-        self.scales = EXACT if is_of_paper else ScaleErrors(distance * distance, turn * turn)
+        self.scales = EXACT if is_of_paper else ScaleErrors.of_sigmas(distance, turn)
         """As the settings have them; the variants of the paper know of no such errors."""
+        self.estimates_scales = rules.estimates_whole_pose and not rules.learns
+        """Whether updates of the pose tell of them. Where heading and position are updated apart,
+        their covariance with each other is not that of their errors."""
         *of_sensor, usual_distance, usual_turn = FIRST_SIGMAS
         self._first_sigmas = (*of_sensor, distance or usual_distance, turn or usual_turn)
 
     def after_block(self, state: State) -> State:
         """The state whose second filters have used the landmarks that were seen, once a block."""
-        return self.with_scales(self._corrected(state))
+        return self._with_scales(self._corrected(state))
 
-    def with_scales(self, state: State) -> State:
-        """The state that considers what it does not know of the odometry's scales."""
-        if not self.scales.are_considered:
+    def _with_scales(self, state: State) -> State:
+        """The state whose covariance contains what the second filters do not know of the scales
+        of the odometry."""
+        memory = state.memory.calibration
+        if self.scales.are_exact or (self.estimates_scales and not memory.filters):
             return state
-        memory, estimate = state.memory.calibration, state.estimate
-        if self._learns:
-            distance, turn = memory.learned.distance_variance, memory.learned.turn_variance
-        else:
-            distance, turn = scale_variances(memory.filters, self.scales)
-        scales, covariance = memory.scales.with_variances(distance, turn, estimate.covariance)
-        state = with_calibration(state, memory._replace(scales=scales))
-        return state._replace(estimate=estimate._replace(covariance=covariance))
+        scales = memory.scales.after_updates(state.estimate, self.estimates_scales)
+        scales = scales.with_variances(*scale_variances(memory.filters, self.scales))
+        return with_calibration(state, memory._replace(scales=scales))
 
     def without_adaptation(self, state: State) -> State:
         """The state without what the robot noticed of its settings and of its map so far."""
         memory, check = state.memory.calibration, ModelCheck(accepted=state.updates.accepted)
         known = CalibrationMemory(memory.learned, memory.references, memory.total_turn_rad, check)
         known = known._replace(common=memory.common, scales=memory.scales)
-        return self.with_scales(with_calibration(state, known))
+        return with_calibration(state, known)
 
     def evidence_since(self, state: State, since_ns: int) -> list[Evidence]:
         """The robot's own evidence of the landmarks of the map after this time."""
@@ -112,8 +115,8 @@ class SecondFilters:
         changed = self._correction(state, filters)
         if changed is None:
             estimate, place = state.estimate, state.odometry_from_robot
-            are_considered = self.scales.are_considered
-            filters = with_probabilities(filters, present, estimate, place, are_considered)
+            estimated = self._estimated(state)
+            filters = with_probabilities(filters, present, estimate, place, estimated)
             return with_calibration(state, memory._replace(filters=filters))
         is_first = present.bearing_bias_rad == 0.0 != changed.bearing_bias_rad
         is_first |= present.ranges == NO_RANGE_ERRORS != changed.ranges
@@ -132,14 +135,19 @@ class SecondFilters:
         state = self.without_adaptation(state.counted("miscalibrated"))
         memory = state.memory.calibration._replace(filters=filters, adaptation=only)
         state = with_calibration(state, memory)
-        return _at_pose(state, filters[0].estimate_at(place, estimate))
+        return _at_pose(state, filters[0])
 
     def _correction(self, state: State, filters: Filters) -> Adaptation | None:
         """What these filters are sure of; None if it changes nothing."""
         if not self._may_correct(state):
             return None
-        present, are_doubtful = state.memory.calibration.adaptation, self.scales.are_considered
-        return correction(filters, present, SIGMAS_OF_DOUBTFUL if are_doubtful else SIGMAS_OF_SCALE)
+        present = state.memory.calibration.adaptation
+        return correction(filters, present, self._estimated(state), not self.scales.are_exact)
+
+    def _estimated(self, state: State) -> Estimated:
+        """Which errors the robot's own filter estimates with the pose."""
+        are_scales = self.estimates_scales and not self.scales.are_exact
+        return Estimated(are_scales, state.common_errors is not None)
 
     def _may_correct(self, state: State) -> bool:
         """Whether wrong settings may be corrected: a wrong distance between the only two landmarks
@@ -152,7 +160,7 @@ class SecondFilters:
         """The second filters after the landmarks that were seen since; empty before they begin."""
         now_ns, estimate, place, odometry, until_ns, _, (recovery, _, memory, events) = state
         filters, gaps = memory.filters, events.get("odometry_gap", 0)
-        if memory.common is not None or not self._names_of_landmarks:
+        if not self._names_of_landmarks or not has_second_filters(memory.common):
             return filters
         is_known = not recovery.lost and estimate.position_sigma_m < MOST_BEGIN_M
         if not filters or any(f.rejected > MOST_REJECTED for f in filters):
@@ -160,7 +168,9 @@ class SecondFilters:
             begin = estimate if is_known else self._rough_estimate(state)
             if begin is None:
                 return ()
-            return (CalibrationFilter.at(now_ns, place, begin, gaps, self._first_sigmas),) * FILTERS
+            first = CalibrationFilter.at(now_ns, place, begin, gaps, self._first_sigmas)
+            return (first._replace(scales=_scales_of(memory)),) * FILTERS
+        filters = tuple([f.for_scales(*_scales_of(memory)) for f in filters])
         is_broken = gaps > filters[0].gaps or now_ns - filters[0].stamp_ns > LONGEST_NS
         is_broken |= odometry is not None and until_ns < now_ns
         if is_broken:
@@ -191,7 +201,7 @@ class SecondFilters:
     def _frames_since(self, state: State, since_ns: int) -> list[Frame]:
         """The landmarks that were seen after this time, as the sensor read them."""
         memory = state.memory.calibration
-        present, frames = memory.adaptation, dict[int, Frame]()
+        present, common, frames = memory.adaptation, memory.common, dict[int, Frame]()
         for e in self.evidence_since(state, since_ns):
             stamp_ns, place, name, x, y, range_m, bearing, sigma_m, sigma_rad, _, _, _, _ = e
             if name == memory.residuals.misplaced:
@@ -200,17 +210,36 @@ class SecondFilters:
                 range_m = (range_m - present.ranges.offset_m) / present.ranges.scale
             if bearing is not None:
                 bearing += present.bearing_bias_rad
-            seen = SeenLandmark(name, x, y, range_m, bearing, sigma_m * sigma_m, sigma_rad**2)
+            variance = sigma_rad**2
+            if common is not None:  # its bias is a state here, not noise
+                _, of_bias = common.reading_variances(common.axis_rad)
+                variance = max(variance - of_bias, self._bearing_variance)
+                bearing = None if bearing is None else bearing + common.errors.yaw_rad
+            seen = SeenLandmark(name, x, y, range_m, bearing, sigma_m * sigma_m, variance)
             frames.setdefault(stamp_ns, Frame(stamp_ns, place, [])).seen.append(seen)
         return sorted(frames.values())
 
 
-def _at_pose(state: State, estimate: Estimate) -> State:
-    """The state at another pose. Why the robot was lost before, and what of the map it blamed for
-    it, is void."""
-    recovery, updates = state.memory.recovery, state.updates
+def _scales_of(memory: CalibrationMemory) -> tuple[float, float]:
+    """Of distances and turns, as the robot's own filter estimates them."""
+    return memory.scales.distance.factor, memory.scales.turn.factor
+
+
+def has_second_filters(common: CommonErrors | None) -> bool:
+    """Whether a robot with these errors beside its pose has second filters: they know of no errors
+    but a bias of bearings and those of ranges."""
+    return common is None or common.is_of_bearings
+
+
+def _at_pose(state: State, known: CalibrationFilter) -> State:
+    """The state at the pose of a second filter. Why the robot was lost before, and what of the map
+    it blamed for it, is void."""
+    recovery, updates, common = state.memory.recovery, state.updates, state.common_errors
+    estimate = known.estimate_at(state.odometry_from_robot, state.estimate)
     state = state.counted("found_again") if recovery.lost else state
     state = at_new_pose(state, estimate)._replace(updates=updates._replace(innovations=1))
+    if common is not None:
+        state = with_common_errors(state, common.with_bearing_bias(*known.bearing_bias))
     return with_recovery(state, no_longer_lost(recovery)._replace(misplaced={}))
 
 
@@ -219,11 +248,14 @@ def with_adaptation(state: State, changed: Adaptation) -> State:
     the time."""
     memory = state.memory.calibration
     check, errors = memory.check, errors_between(memory.adaptation, changed)
-    sensitivity = check.sensitivity
-    if memory.scales.are_considered:
-        sensitivity = memory.scales.sensitivity_at(state.estimate.covariance)
-    pose = offset_pose(state.estimate.pose, pose_offset(sensitivity, errors), POSE)
-    distance, turn, _ = errors
+    distance, turn, bias_rad = errors
+    if memory.scales.are_exact:
+        offset = pose_offset(check.sensitivity, errors)
+    else:
+        dx, dy, turned = memory.scales.pose_offset(state.estimate, distance, turn)
+        x, y, heading = pose_offset(check.sensitivity, (0.0, 0.0, bias_rad))
+        offset = x + dx, y + dy, heading + turned
+    pose = offset_pose(state.estimate.pose, offset, POSE)
     memory = memory._replace(
         check=check._replace(evidence=check.evidence.without(errors)),
         adaptation=changed,

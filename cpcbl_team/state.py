@@ -192,6 +192,8 @@ class State(NamedTuple):
         """The estimate as it is belief to others: as uncertain as the settings are, too."""
         known = self.memory.calibration
         estimate = with_doubts(with_arc_width(self.estimate), known.check)
+        if (doubt := known.scales.doubt) is not ZERO3:
+            estimate = estimate._replace(covariance=estimate.covariance.plus(doubt))
         return with_doubt(estimate, self.odometry_from_robot, known.filters, known.adaptation)
 
     @property

@@ -96,6 +96,10 @@ class SensorSettings(SensorModel, frozen=True, forbid_unknown_fields=True, kw_on
 
     max_range_for_range_m: Positive = 1000.0
     """Of an object that is farther away only the bearing is good enough to be used."""
+    bearing_bias_sigma_deg: NotNegative = 0.0
+    """The sigma of `bearing_bias_deg`: how far the sensor may be turned on another day. 0: the
+    robot takes its mounting for exact until it finds that it is not. Of a camera whose images the
+    robot reads itself, `camera.yaw_sigma_deg` says this."""
     sees_landmarks: bool = True
     sees_robots: bool = True
 

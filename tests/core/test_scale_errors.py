@@ -1,4 +1,4 @@
-"""Scales of odometry that are not known exactly: dead reckoning says how far they may lead it."""
+"""Scales of odometry that are not known exactly: considered, and estimated beside the pose."""
 
 import math
 from typing import NamedTuple
@@ -31,16 +31,16 @@ from cpcbl_team.config import (
     Start,
     Variant,
 )
-from cpcbl_team.constant_errors import INSENSITIVE
-from cpcbl_team.estimate import Estimate
+from cpcbl_team.estimate import POSE, Estimate, offset_pose
 from cpcbl_team.geometry import Pose2, step
 from cpcbl_team.inputs import InitialPose, InputsMended, Odometry
 from cpcbl_team.localizer import Localizer
 from cpcbl_team.motion import motion_jacobian, motion_noise, move
-from cpcbl_team.scale_errors import EXACT, ScaleErrors
-from cpcbl_team.state import State
+from cpcbl_team.scale_errors import EXACT, INDEPENDENT, ScaleErrors
+from cpcbl_team.state import State, with_calibration
 
 NOISE = OdometryNoise()
+EYE2 = np.eye(2)
 SIGMAS = 0.1, 0.2  # of the scales of distances and turns
 PIECE_NS = SECOND // 10
 ARC = 0.05, 0.04  # m and rad of each piece
@@ -51,16 +51,19 @@ SENSOR = SensorSettings(range_share=0.03, bearing_sigma_deg=2.0, field_of_view_d
 def moved(
     estimate: Estimate, scales: ScaleErrors, arc: tuple[float, float]
 ) -> tuple[Estimate, ScaleErrors]:
-    """The estimate after an arc, and what the scales have done to it."""
-    after = move(estimate, *arc, NOISE)
-    scales, added = scales.after_motion(estimate.pose, estimate.covariance, *arc)
+    """The estimate after an arc by this odometry, and what is known of the scales then."""
+    scales, offset = scales.after_updates(estimate).corrected()
+    estimate = estimate._replace(pose=offset_pose(estimate.pose, offset, POSE))
+    corrected = arc[0] * scales.distance.factor, arc[1] * scales.turn.factor
+    after = move(estimate, *corrected, NOISE)
+    scales, added = scales.after_motion(estimate, *corrected)
     after = after._replace(covariance=after.covariance.plus(added))
-    return after, scales._replace(covariance=after.covariance)
+    return after, scales._replace(estimate=after)
 
 
 def updated(covariance: Matrix, rows: Matrix, noise: float) -> tuple[Matrix, Matrix]:
     """The covariance after an update by readings (`rows`), and 1 - K H."""
-    gain = covariance @ rows.T @ np.linalg.inv(rows @ covariance @ rows.T + noise * np.eye(2))
+    gain = covariance @ rows.T @ np.linalg.inv(rows @ covariance @ rows.T + noise * EYE2)
     left = np.eye(3) - gain @ rows
     return left @ covariance, left
 
@@ -68,7 +71,7 @@ def updated(covariance: Matrix, rows: Matrix, noise: float) -> tuple[Matrix, Mat
 def test_covariance_is_that_of_a_filter_that_considers_both_scales() -> None:
     """Of one with five states, of which only the pose is updated (Schmidt)."""
     rng = np.random.default_rng(1)
-    scales, pose = ScaleErrors(SIGMAS[0] ** 2, SIGMAS[1] ** 2), Pose2(1.0, 2.0, 0.3)
+    scales, pose = ScaleErrors.of_sigmas(*SIGMAS), Pose2(1.0, 2.0, 0.3)
     estimate = Estimate(pose, diagonal(0.05, 0.02))
     reference = np.zeros((5, 5))
     reference[:3, :3] = matrix3(estimate.covariance)
@@ -83,6 +86,7 @@ def test_covariance_is_that_of_a_filter_that_considers_both_scales() -> None:
         noise = np.zeros((5, 5))
         noise[:3, :3] = matrix3(motion_noise(estimate.pose.heading, *arc, NOISE))
         reference = whole @ reference @ whole.T + noise
+        scales = scales.after_updates(estimate, estimates=False)
         estimate, scales = moved(estimate, scales, arc)
         if i % 10 == 9:
             rows = rng.normal(size=(2, 3))
@@ -94,9 +98,50 @@ def test_covariance_is_that_of_a_filter_that_considers_both_scales() -> None:
             reference = both @ reference @ both.T + 0.01 * gain @ gain.T
             estimate = estimate._replace(covariance=covariance3(now))
         assert matrix3(estimate.covariance) == pytest.approx(reference[:3, :3], abs=1e-12)
-        sensitivity = np.reshape(scales.sensitivity_at(estimate.covariance), (3, 3))[:, :2]
-        due = reference[:3, 3:] @ np.linalg.inv(reference[3:, 3:])
-        assert sensitivity == pytest.approx(due, abs=1e-9)
+        known = scales.after_updates(estimate, estimates=False)
+        both = np.array([known.distance.covariance, known.turn.covariance])
+        assert both == pytest.approx(reference[3:, :3], abs=1e-12)
+
+
+def test_one_update_says_of_the_scales_what_a_filter_with_five_states_says() -> None:
+    """The mean of both, and their variances, after a way without updates and one update."""
+    rng = np.random.default_rng(2)
+    estimate, scales = Estimate(Pose2(1.0, 2.0, 0.3), diagonal(0.05, 0.02)), None
+    scales = ScaleErrors.of_sigmas(*SIGMAS)
+    for _ in range(40):
+        estimate, scales = moved(estimate, scales, (0.05, float(rng.uniform(-0.02, 0.04))))
+    whole = np.zeros((5, 5))
+    whole[:3, :3] = matrix3(estimate.covariance)
+    whole[3:, 3:] = np.diag(np.square(SIGMAS))
+    both = np.array([scales.distance.covariance, scales.turn.covariance])
+    whole[3:, :3], whole[:3, 3:] = both, both.T
+    rows = np.hstack([rng.normal(size=(2, 3)), np.zeros((2, 2))])
+    gain = whole @ rows.T @ np.linalg.inv(rows @ whole @ rows.T + 1e-3 * EYE2)
+    mean = gain @ np.array([0.02, -0.01])
+    left = (np.eye(5) - gain @ rows) @ whole
+    x, y, heading = mean[:3].tolist()
+    pose = offset_pose(estimate.pose, (x, y, heading), POSE)
+    known = scales.after_updates(Estimate(pose, covariance3(left[:3, :3])))
+    assert (known.distance.error, known.turn.error) == pytest.approx(mean[3:], abs=1e-12)
+    assert known.variances == pytest.approx(np.diag(left)[3:], abs=1e-12)
+
+
+def test_an_error_that_is_expected_is_no_news() -> None:
+    """A correction of the pose by what the error that is known has moved it by."""
+    estimate, scales = Estimate(Pose2(0.0, 0.0, 0.0), diagonal(0.05, 0.02)), None
+    scales = ScaleErrors.of_sigmas(*SIGMAS)
+    for _ in range(20):
+        estimate, scales = moved(estimate, scales, (0.05, 0.02))
+    turn = scales.turn._replace(error=0.05, offset=(0.01, 0.02, 0.03))
+    scales = scales._replace(turn=turn)
+    now = matrix3(estimate.covariance)
+    left, remains = updated(now, np.eye(2, 3), 0.01)
+    x, y, heading = ((np.eye(3) - remains) @ np.array(scales.offset)).tolist()
+    pose = offset_pose(estimate.pose, (x, y, heading), POSE)
+    known = scales.after_updates(Estimate(pose, covariance3(left)))
+    assert known.turn.error == pytest.approx(0.05)
+    assert known.distance.error == pytest.approx(0.0, abs=1e-12)
+    assert known.variances[1] < scales.variances[1]
 
 
 @given(
@@ -109,25 +154,34 @@ def test_covariance_is_that_of_a_filter_that_considers_both_scales() -> None:
 def test_covariance_stays_one_whatever_happens(
     events: list[tuple[float, float, bool, float]],
 ) -> None:
-    """After motions, updates, poses from elsewhere and other variances of the scales."""
-    scales, estimate = ScaleErrors(0.01, 0.04), Estimate(Pose2(0.0, 0.0, 0.0), diagonal(0.1, 0.1))
+    """Of pose and scales, after motions, updates, and poses and covariances from elsewhere."""
+    scales = ScaleErrors.of_sigmas(0.1, 0.2)
+    estimate = Estimate(Pose2(0.0, 0.0, 0.0), diagonal(0.1, 0.1))
     for distance, turn, is_update, sigma in events:
         estimate, scales = moved(estimate, scales, (distance, turn))
         if is_update:
-            now, _ = updated(matrix3(estimate.covariance), np.eye(2, 3), 0.01)
-            estimate = estimate._replace(covariance=covariance3(now))
+            before = matrix3(estimate.covariance)
+            gain = before[:, :2] @ np.linalg.inv(before[:2, :2] + 0.01 * EYE2)
+            now = before - gain @ before[:2]
+            pose = displaced(estimate.pose, diagonal(0.3, 0.3), np.random.default_rng(1))
+            estimate = Estimate(pose, covariance3(0.5 * (now + now.T)))
         elif sigma > 0.2:
             estimate = estimate._replace(covariance=diagonal(sigma, 0.5 * sigma))
-        variance = sigma * sigma
-        scales, covariance = scales.with_variances(variance, 0.5 * variance, estimate.covariance)
-        estimate = estimate._replace(covariance=covariance)
-        size = float(np.trace(matrix3(covariance)))
-        assert least_eigenvalue(matrix3(covariance)) > -1e-12 * max(size, 1.0)
+        known = scales.after_updates(estimate)
+        whole = np.zeros((5, 5))
+        whole[:3, :3] = matrix3(estimate.covariance)
+        whole[3, :3] = whole[:3, 3] = known.distance.covariance
+        whole[4, :3] = whole[:3, 4] = known.turn.covariance
+        whole[3:, 3:] = np.diag(known.considered)
+        size = float(np.trace(whole))
+        assert least_eigenvalue(whole) > -1e-9 * max(size, 1.0)
+        assert 0.0 < known.distance.factor < math.inf
+        assert 0.0 < known.turn.factor < math.inf
 
 
 def test_an_error_of_scale_grows_with_the_way_not_with_its_root() -> None:
     estimate = Estimate(Pose2(0.0, 0.0, 0.0), diagonal(0.0, 0.0))
-    scales = ScaleErrors(0.01, 0.0)
+    scales = ScaleErrors.of_sigmas(0.1, 0.0)
     for _ in range(100):
         estimate, scales = moved(estimate, scales, (0.1, 0.0))
     alone = Estimate(Pose2(0.0, 0.0, 0.0), diagonal(0.0, 0.0))
@@ -137,18 +191,32 @@ def test_an_error_of_scale_grows_with_the_way_not_with_its_root() -> None:
     assert estimate.covariance.yy == pytest.approx(alone.covariance.yy)
 
 
-def test_scales_that_become_less_certain_make_the_pose_less_certain() -> None:
-    scales, estimate = ScaleErrors(0.01, 0.0), Estimate(Pose2(0.0, 0.0, 0.0), diagonal(0.1, 0.1))
-    for _ in range(100):
+def test_a_scale_that_is_exact_stays_so() -> None:
+    scales = ScaleErrors.of_sigmas(0.0, 0.2)
+    estimate = Estimate(Pose2(0.0, 0.0, 0.0), diagonal(0.1, 0.1))
+    for _ in range(20):
+        estimate, scales = moved(estimate, scales, (0.05, 0.05))
+    (x, y, heading), covariance, _ = estimate
+    now = Estimate(Pose2(x + 0.1, y, heading + 0.05), covariance.scaled(0.5))
+    known = scales.after_updates(now)
+    assert known.distance.error == 0.0
+    assert known.variances[0] == 0.0
+    assert known.turn.error > 0.0
+    assert known.variances[1] < 0.2**2
+
+
+def test_a_correction_of_another_size_changes_a_scale_by_three_sigma_at_most() -> None:
+    scales, estimate = (
+        ScaleErrors.of_sigmas(0.1, 0.0),
+        Estimate(Pose2(0.0, 0.0, 0.0), diagonal(0.05, 0.02)),
+    )
+    for _ in range(20):
         estimate, scales = moved(estimate, scales, (0.1, 0.0))
-    _, more = scales.with_variances(0.04, 0.0, estimate.covariance)
-    assert more.xx - estimate.covariance.xx == pytest.approx(0.03 * 10.0**2)
-    after, same = scales.with_variances(0.0001, 0.0, estimate.covariance)
-    assert same == estimate.covariance
-    assert after.distance == 0.0001
+    far = Estimate(Pose2(50.0, 0.0, 0.0), estimate.covariance.scaled(0.1))
+    assert 0.0 < scales.after_updates(far).distance.error < 0.31
 
 
-def test_exact_scales_are_not_considered() -> None:
+def test_exact_scales_are_no_states() -> None:
     robot = localizer("joint", start=START, odometry=OdometrySettings())
     state = robot.add_odometry(robot.start(0), Odometry(0, PIECE_NS, *ARC))
     state = robot.predict(state, PIECE_NS)
@@ -162,7 +230,7 @@ def test_exact_scales_are_not_considered() -> None:
         LocalizerSettings(variant="oval", paper_uncertainty=True),
     ],
 )
-def test_variants_of_the_paper_never_consider_scales(rules: LocalizerSettings) -> None:
+def test_variants_of_the_paper_take_scales_for_exact(rules: LocalizerSettings) -> None:
     """Nor after their inputs were wrong for some time."""
     odometry = OdometrySettings(distance_scale_sigma=0.1, turn_scale_sigma=0.2)
     robot = localizer(rules=rules, start=START, odometry=odometry)
@@ -175,11 +243,31 @@ def test_variants_of_the_paper_never_consider_scales(rules: LocalizerSettings) -
 def test_a_pose_that_somebody_sets_owes_nothing_to_the_way_to_it() -> None:
     robot = robot_of()
     state = driven_blind(robot.start(0), robot, 50)
-    assert state.memory.calibration.scales.are_considered
-    assert state.memory.calibration.scales.sensitivity != INSENSITIVE
+    assert state.memory.calibration.scales.distance.covariance != INDEPENDENT
     covariance = 0.01, 0.0, 0.01, 0.0, 0.0, 0.01
     given = InitialPose(state.stamp_ns, 1.0, 1.0, 0.0, covariance)
-    assert robot.set_pose(state, given).memory.calibration.scales.sensitivity == INSENSITIVE
+    known = robot.set_pose(state, given).memory.calibration.scales
+    assert known.distance.covariance == known.turn.covariance == INDEPENDENT
+    assert known.estimate is None
+
+
+def test_a_robot_that_stands_moves_to_where_its_scales_say() -> None:
+    """What is corrected of a scale corrects the pose, also if the next piece of odometry is of no
+    motion."""
+    robot = robot_of()
+    state = driven_blind(robot.start(0), robot, 50)
+    memory = state.memory.calibration
+    turn = memory.scales.turn._replace(error=0.1, offset=(0.3, 0.2, 0.1))
+    known = memory.scales._replace(turn=turn, variances=(1e-4, 1e-4))
+    state = with_calibration(state, memory._replace(scales=known))
+    now = state.stamp_ns
+    standing = robot.add_odometry(state, Odometry(now, now + PIECE_NS, 0.0, 0.0))
+    standing = robot.predict(standing, now + PIECE_NS)
+    scales = standing.memory.calibration.scales
+    share = 1.0 - scales.turn.offset[0] / 0.3
+    assert share > 0.5
+    assert standing.estimate.pose.x - state.estimate.pose.x == pytest.approx(0.3 * share)
+    assert standing.estimate.pose.y - state.estimate.pose.y == pytest.approx(0.2 * share)
 
 
 # A robot whose wheels are of another day --------------------------------------------------------
@@ -248,8 +336,8 @@ def test_scales_are_known_after_some_time_among_landmarks() -> None:
         pose, now = displaced(step(pose, distance, turn), noise, rng), state.stamp_ns
         state = robot.add_odometry(state, Odometry(now, now + PIECE_NS, *ARC))
         state = robot.cycle(state, frame(pose, now + PIECE_NS, noise=errors))
-    memory = state.memory.calibration
-    assert memory.adaptation.distance_scale == pytest.approx(1.15, abs=0.05)
-    assert memory.adaptation.turn_scale == pytest.approx(0.7, abs=0.05)
-    assert math.sqrt(memory.scales.distance) < 0.05
-    assert math.sqrt(memory.scales.turn) < 0.05
+    scales = state.memory.calibration.scales
+    assert scales.distance.factor == pytest.approx(1.15, abs=0.03)
+    assert scales.turn.factor == pytest.approx(0.7, abs=0.03)
+    assert math.sqrt(scales.variances[0]) < 0.02
+    assert math.sqrt(scales.variances[1]) < 0.025

@@ -115,7 +115,8 @@ def worlds() -> dict[str, World]:
     for gives, text in KINDS[1:]:
         team = with_settings(_alone(_field(4, gives)), None, start=wide)
         found[f"wide prior{text}"] = World(team, ("r",))
-    found |= _odometry_worlds() | _wheel_worlds() | _unknown_pose_worlds()
+    found |= _odometry_worlds() | _wheel_worlds() | _turned_sensor_worlds()
+    found |= _unknown_pose_worlds()
     found |= _team_worlds() | _miscalibrated_worlds()
     return found | _uncertain_map_worlds() | _unsurveyed_worlds()
 
@@ -156,6 +157,21 @@ def _wheel_worlds() -> dict[str, World]:
     world = circuit_world("a")
     team = with_settings(world.team, None, odometry=ANOTHER_DAY)
     found["wheels of another day, clique, one sees landmarks"] = world._replace(team=team)
+    return found
+
+
+TURNED = {"bearing_bias_sigma_deg": 3.0}  # keys of a sensor that was bumped
+
+
+def _turned_sensor_worlds() -> dict[str, World]:
+    """Robots whose sensor may be turned; `run_world` draws by how much."""
+    found: dict[str, World] = {}
+    for count in (1, 2, 4):
+        team = with_settings(_alone(_field(count)), None, sensor=TURNED)
+        found[f"sensor turned, {_landmarks(count)}"] = World(team, ("r",))
+    world = circuit_world("a")
+    team = with_settings(world.team, None, sensor=TURNED, odometry=ANOTHER_DAY)
+    found["sensor turned and wheels of another day, clique"] = world._replace(team=team)
     return found
 
 

@@ -114,9 +114,9 @@ def with_true_starts(team: Team, seed: int) -> Team:
     return replace(team, robots=robots)
 
 
-def with_true_wheels(team: Team, seed: int) -> Team:
-    """The team as it is: the scales of each robot's odometry differ from the stated ones by as much
-    as it states that they may."""
+def with_true_calibration(team: Team, seed: int) -> Team:
+    """The team as it is: the scales of each robot's odometry, and the bias of its bearings, differ
+    from the stated ones by as much as it states that they may."""
     random, robots = Random(f"wheels {seed}"), dict(team.robots)
     for name, settings in team.robots.items():
         wheels = settings.odometry
@@ -127,7 +127,10 @@ def with_true_wheels(team: Team, seed: int) -> Team:
             distance_scale=wheels.distance_scale * max(1.0 + by_distance, LEAST_SCALE),
             turn_scale=wheels.turn_scale * max(1.0 + by_turn, LEAST_SCALE),
         )
-        robots[name] = replace(settings, odometry=wheels)
+        sensor = settings.sensor
+        turned_deg = random.gauss(0.0, sensor.bearing_bias_sigma_deg)
+        sensor = replace(sensor, bearing_bias_deg=sensor.bearing_bias_deg + turned_deg)
+        robots[name] = replace(settings, odometry=wheels, sensor=sensor)
     return replace(team, robots=robots)
 
 
@@ -136,7 +139,7 @@ def run_world(
 ) -> list[WorldRun]:
     """One run of a world: the figures of each scored robot. `watch` may subscribe to it."""
     wrappers = {name: partial(_lossy_bus, world, seed, name) for name in world.team.robots}
-    truth = with_true_wheels(with_true_starts(world.truth or world.team, seed), seed)
+    truth = with_true_calibration(with_true_starts(world.truth or world.team, seed), seed)
     team, length_s = world.team, world.duration_s
     _, recorder = simulate(team, seed, length_s, truth, watch, bus_wrappers=wrappers)
     true_paths = recorder.simulated_truth()

@@ -1,0 +1,167 @@
+"""A sensor that may be turned: the bias of its bearings is a state beside the pose."""
+
+import math
+
+import numpy as np
+import pytest
+from msgspec.structs import replace
+from support.core import CORNERS, SECOND, displaced, frame, localizer, sensor_noise
+
+from cpcbl_team.calibration_filter import FIRST_SIGMAS, CalibrationFilter
+from cpcbl_team.common_error_filter import common_error_filter
+from cpcbl_team.common_errors import CommonErrors
+from cpcbl_team.config import (
+    CameraSettings,
+    LocalizerSettings,
+    OdometryNoise,
+    SensorSettings,
+    Start,
+)
+from cpcbl_team.estimate import Estimate
+from cpcbl_team.geometry import Pose2, step, wrap_angle
+from cpcbl_team.inputs import Odometry, Sighting
+from cpcbl_team.localizer import Localizer
+from cpcbl_team.motion import motion_noise
+from cpcbl_team.second_filters import has_second_filters
+from cpcbl_team.state import State
+
+PIECE_NS = SECOND // 10
+ARC = 0.05, 0.04  # m and rad of each piece
+NOISE = OdometryNoise()
+START = Start(x_m=0.0, y_m=-1.2, heading_deg=0.0, sigma_m=0.02, heading_sigma_deg=1.0)
+EXACT = SensorSettings(range_share=0.03, bearing_sigma_deg=1.0, field_of_view_deg=60.0)
+DOUBTED = replace(EXACT, bearing_bias_sigma_deg=3.0)
+
+
+def robot_of(sensor: SensorSettings, rules: LocalizerSettings | None = None) -> Localizer:
+    return localizer(field=CORNERS, start=START, sensor=sensor, rules=rules)
+
+
+def run(
+    robot: Localizer, bias_rad: float, seed: int, pieces: int = 600, range_factor: float = 1.0
+) -> tuple[State, float, float]:
+    """A robot in an arc whose sensor sees 60° and is turned: its last state, the root of the mean
+    square of its position's error (m), and the mean NEES of its positions (2 is due)."""
+    rng, state = np.random.default_rng(seed), robot.start(0)
+    pose = displaced(state.estimate.pose, state.estimate.covariance, rng)
+    noise, errors, squares = sensor_noise(rng, EXACT), [], []
+
+    def read(exact: Sighting) -> Sighting:
+        s = noise(exact)
+        range_m, bearing_rad = range_factor * (s.range_m or 0.0), (s.bearing_rad or 0.0) + bias_rad
+        return replace(s, range_m=range_m, bearing_rad=wrap_angle(bearing_rad))
+
+    for _ in range(pieces):
+        now = state.stamp_ns + PIECE_NS
+        moved = motion_noise(pose.heading, *ARC, NOISE)
+        pose = displaced(step(pose, *ARC), moved, rng)
+        state = robot.add_odometry(state, Odometry(state.stamp_ns, now, *ARC))
+        seen = frame(pose, now, noise=read)
+        half_rad = math.radians(30.0)
+        visible = [s for s in seen.sightings if abs((s.bearing_rad or 0.0) - bias_rad) < half_rad]
+        state = robot.cycle(state, replace(seen, sightings=tuple(visible)))
+        (x, y, _), covariance, _ = state.reported
+        dx, dy = x - pose.x, y - pose.y
+        errors.append(dx * dx + dy * dy)
+        squares.append(covariance.position().mahalanobis_squared(dx, dy))
+    return state, math.sqrt(np.mean(errors)), float(np.mean(squares))
+
+
+def common_of(state: State) -> CommonErrors:
+    common = state.common_errors
+    assert common is not None
+    return common
+
+
+@pytest.mark.parametrize("bias_deg", [-5.0, 3.0])
+def test_the_bias_is_found_and_the_pose_is_right(bias_deg: float) -> None:
+    bias_rad = math.radians(bias_deg)
+    runs = [run(robot_of(DOUBTED), bias_rad, seed) for seed in range(4)]
+    for state, _, _ in runs:
+        common = common_of(state)
+        sigma_rad = common.camera_sigmas.yaw_rad
+        assert sigma_rad < math.radians(0.6)
+        assert abs(common.errors.yaw_rad - bias_rad) < 3.5 * sigma_rad
+        learned = state.memory.calibration.corrected
+        assert learned.bearing_bias_rad == common.errors.yaw_rad
+    assert np.mean([nees for _, _, nees in runs]) < 2.8
+    alone = [run(robot_of(EXACT), bias_rad, seed) for seed in range(4)]
+    assert np.mean([e for _, e, _ in runs]) < 0.8 * np.mean([e for _, e, _ in alone])
+    assert np.mean([nees for _, _, nees in alone]) > 4.0
+
+
+def test_a_sensor_that_is_as_stated_loses_little() -> None:
+    runs = [run(robot_of(DOUBTED), 0.0, seed) for seed in range(4)]
+    alone = [run(robot_of(EXACT), 0.0, seed) for seed in range(4)]
+    assert np.mean([nees for _, _, nees in runs]) < 2.8
+    assert np.mean([e for _, e, _ in runs]) < 1.5 * np.mean([e for _, e, _ in alone])
+
+
+def test_a_mounting_that_is_exact_is_no_state() -> None:
+    assert robot_of(EXACT).start(0).common_errors is None
+
+
+@pytest.mark.parametrize(
+    "rules",
+    [
+        LocalizerSettings(variant="oval"),
+        LocalizerSettings(variant="circular"),
+        LocalizerSettings(variant="weighted"),
+        LocalizerSettings(self_calibration=True),
+    ],
+)
+def test_other_variants_and_robots_that_calibrate_themselves_do_without(
+    rules: LocalizerSettings,
+) -> None:
+    assert robot_of(DOUBTED, rules).start(0).common_errors is None
+
+
+def test_the_settings_of_a_camera_of_its_own_come_first() -> None:
+    settings = robot_of(DOUBTED).settings
+    camera = CameraSettings(yaw_sigma_deg=1.0, focal_share=0.0, centre_share=0.0)
+    found = common_error_filter(settings, CORNERS, camera)
+    assert found is not None
+    assert found.prior.camera_sigmas.yaw_rad == pytest.approx(math.radians(1.0))
+    exact = replace(camera, yaw_sigma_deg=0.0)
+    assert common_error_filter(settings, CORNERS, exact) is None
+
+
+def test_wrong_ranges_are_still_found_by_second_filters() -> None:
+    state, error_m, _ = run(robot_of(DOUBTED), math.radians(3.0), 1, 1200, range_factor=1.1)
+    adaptation = state.memory.calibration.adaptation
+    assert adaptation.bearing_bias_rad == 0.0  # the robot's own filter has it
+    assert adaptation.ranges.scale == pytest.approx(1.0 / 1.1, abs=0.04)
+    _, alone_m, _ = run(robot_of(EXACT), math.radians(3.0), 1, 1200, range_factor=1.1)
+    assert error_m < alone_m
+
+
+def test_wrong_ranges_make_no_bias_that_the_settings_exclude() -> None:
+    state, _, _ = run(robot_of(DOUBTED), math.radians(3.0), 1, 300, range_factor=1.1)
+    assert abs(common_of(state).errors.yaw_rad) <= 3.0 * math.radians(3.0)
+
+
+def test_second_filters_know_nothing_of_other_errors_of_a_camera() -> None:
+    robot = robot_of(DOUBTED)
+    assert has_second_filters(None)
+    assert has_second_filters(common_of(robot.start(0)))
+    camera = Localizer(robot.settings, CORNERS, camera=CameraSettings())
+    assert not has_second_filters(common_of(camera.start(0)))
+
+
+def test_a_bias_that_was_found_with_the_pose_keeps_its_covariance_with_it() -> None:
+    begin = Estimate(Pose2(0.0, 0.0, 0.0), robot_of(DOUBTED).start(0).estimate.covariance)
+    known = CalibrationFilter.at(0, Pose2(0.0, 0.0, 0.0), begin)
+    rows = [list(row) for row in known.covariance]
+    rows[2][3] = rows[3][2] = 0.004
+    known = known._replace(covariance=tuple(map(tuple, rows)), errors=(0.05, 0.0, 0.0, 0.0, 0.0))
+    common = common_of(robot_of(DOUBTED).start(0)).with_bearing_bias(*known.bearing_bias)
+    assert common.errors.yaw_rad == 0.05
+    assert common.camera_sigmas.yaw_rad == pytest.approx(FIRST_SIGMAS[0])
+    assert common.parameters.with_pose[0] == (0.0, 0.0, 0.004)
+    assert common.is_of_bearings
+
+
+def test_time_makes_no_other_error_of_it() -> None:
+    common = common_of(robot_of(DOUBTED).start(0)).after_time(1000.0)
+    assert common.camera_sigmas.yaw_rad == pytest.approx(math.hypot(math.radians(3.0), 0.01))
+    assert common.is_of_bearings
