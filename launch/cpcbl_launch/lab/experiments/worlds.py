@@ -117,18 +117,19 @@ def with_true_starts(team: Team, seed: int) -> Team:
 def with_true_calibration(team: Team, seed: int) -> Team:
     """The team as it is: the scales of each robot's odometry, and the bias of its bearings, differ
     from the stated ones by as much as it states that they may."""
-    random, robots = Random(f"wheels {seed}"), dict(team.robots)
+    of_wheels, of_sensors = Random(f"wheels {seed}"), Random(f"sensors {seed}")
+    robots = dict(team.robots)
     for name, settings in team.robots.items():
         wheels = settings.odometry
-        by_distance = random.gauss(0.0, wheels.distance_scale_sigma)
-        by_turn = random.gauss(0.0, wheels.turn_scale_sigma)
+        by_distance = of_wheels.gauss(0.0, wheels.distance_scale_sigma)
+        by_turn = of_wheels.gauss(0.0, wheels.turn_scale_sigma)
         wheels = replace(
             wheels,
             distance_scale=wheels.distance_scale * max(1.0 + by_distance, LEAST_SCALE),
             turn_scale=wheels.turn_scale * max(1.0 + by_turn, LEAST_SCALE),
         )
         sensor = settings.sensor
-        turned_deg = random.gauss(0.0, sensor.bearing_bias_sigma_deg)
+        turned_deg = of_sensors.gauss(0.0, sensor.bearing_bias_sigma_deg)
         sensor = replace(sensor, bearing_bias_deg=sensor.bearing_bias_deg + turned_deg)
         robots[name] = replace(settings, odometry=wheels, sensor=sensor)
     return replace(team, robots=robots)
