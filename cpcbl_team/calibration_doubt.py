@@ -29,7 +29,7 @@ from cpcbl_team.estimate import (
     pose_chi_square,
     pose_difference,
 )
-from cpcbl_team.filter_corrections import NOT_ESTIMATED, Estimated
+from cpcbl_team.filter_corrections import NONE, KindsOfError
 from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.geometry import Pose2
 from cpcbl_team.miscalibration import Adaptation
@@ -51,18 +51,18 @@ def with_probabilities(
     present: Adaptation,
     estimate: Estimate,
     place: Pose2,
-    estimated: Estimated = NOT_ESTIMATED,
+    considered: KindsOfError = NONE,
 ) -> tuple[CalibrationFilter, ...]:
     """The filters that know how likely it is that the settings are wrong in the way in which each
     of them says. `present`: what of the settings is corrected already. Where they agree about
     another pose than the robot's own `estimate` (at `place` by odometry), one of both is wrong, and
     nothing says which: either the settings are, or the robot is elsewhere than it was led.
-    `estimated`: which errors are in the covariance of the `estimate`."""
+    `considered`: which errors are in the covariance of the `estimate`."""
     share = 1.0 / max(len(filters), 1)
     if _contradict(filters, estimate, place):
         odds = [share for _ in filters]
     else:
-        odds = [share * ODDS * _ratio(f, present, estimated) for f in filters]
+        odds = [share * ODDS * _ratio(f, present, considered) for f in filters]
     every = sum(odds)
     k = 1.0 / (1.0 + every) if every > LEAST else 0.0
     return tuple([f._replace(probability=k * o) for f, o in zip(filters, odds, strict=True)])
@@ -108,7 +108,7 @@ def scale_variances(filters: Filters, first: ScaleErrors) -> tuple[float, float]
     """The mean squares of the errors of the distance's and the turn's scale that these filters know
     of, about the present scales; `first`: as it is without filters."""
     if not filters:
-        return first.first
+        return first.distance.first, first.turn.first
     distance, turn = [
         fmean([e * e + CHORD_FACTOR * s * s for e, s in [f.error(place) for f in filters]])
         for place in (DISTANCE, TURN)
@@ -140,10 +140,10 @@ def _are_apart(one: Estimate, other: Estimate) -> bool:
     return pose_chi_square(one, other) > CONTRADICTION
 
 
-def _ratio(f: CalibrationFilter, present: Adaptation, estimated: Estimated) -> float:
+def _ratio(f: CalibrationFilter, present: Adaptation, considered: KindsOfError) -> float:
     """How much likelier the sightings are with a bias of bearings, with that and wrong ranges, or
     with a wrong scale of the odometry, than with the settings as they are; what speaks for these
-    does not count. Of errors that its own filter estimates only the others are compared."""
+    does not count. Errors that are considered are not compared."""
     found, first = f.errors, FIRST_SIGMAS
     errors = (
         found[0] - present.bearing_bias_rad,
@@ -153,12 +153,12 @@ def _ratio(f: CalibrationFilter, present: Adaptation, estimated: Estimated) -> f
     covariance = _sensor_covariance(f.covariance).scaled(f.scatter)
     if min(covariance.xx, covariance.yy, covariance.hh) <= 0.0:
         return 0.0
-    ratios = [0.0 if estimated.bearing_bias else _single_ratio(errors[0], covariance.xx, first[0])]
-    for place in () if estimated.scales else (DISTANCE, TURN):
+    ratios = [0.0 if considered.bearing_bias else _single_ratio(errors[0], covariance.xx, first[0])]
+    for place in () if considered.scales else (DISTANCE, TURN):
         error, sigma = f.error(place)
         variance = CHORD_FACTOR * sigma * sigma
         ratios.append(_single_ratio(error, variance, first[place - BEARING]))
-    if estimated.bearing_bias:
+    if considered.bearing_bias:
         ratios.append(_ranges_ratio(errors[1:], covariance))
     elif not _is_singular(covariance):
         chi_square = dot(errors, covariance.inverse().times(errors))

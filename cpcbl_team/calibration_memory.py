@@ -42,7 +42,7 @@ class CalibrationMemory(NamedTuple):
     def corrected(self) -> SelfCalibration:
         """All that the robot knows of the scales of its odometry and the bias of its bearings."""
         known, adapted = self.learned, self.adaptation
-        by_distance, by_turn = self.scales.distance.factor, self.scales.turn.factor
+        by_distance, by_turn = self.scales.factors
         return known._replace(
             distance_scale=known.distance_scale * adapted.distance_scale * by_distance,
             turn_scale=known.turn_scale * adapted.turn_scale * by_turn,

@@ -33,26 +33,26 @@ ALIKE: Final = 0.5  # by less than this part of it what one filter finds differs
 SETTLED_RAD: Final = math.radians(1.0)  # sigma of a bias that is known
 
 
-class Estimated(NamedTuple):
-    """Which errors of the settings are states of the robot's own filter."""
+class KindsOfError(NamedTuple):
+    """Some of the errors that settings may have."""
 
     scales: bool  # those of the odometry
     bearing_bias: bool
 
 
-NOT_ESTIMATED: Final = Estimated(False, False)
+NONE: Final = KindsOfError(False, False)
 
 
 def correction(
     filters: Filters,
     present: Adaptation,
-    estimated: Estimated = NOT_ESTIMATED,
+    estimated: KindsOfError = NONE,
     are_doubtful: bool = False,
 ) -> Adaptation | None:
     """The settings with the errors that are clear to each filter, and large enough to be worth it;
     None if that changes nothing. What is corrected already follows what is known.
-    `estimated`: which errors the robot's own filter estimates; `are_doubtful`: whether the settings
-    say that the scales of the odometry may be wrong."""
+    `estimated`: which errors the robot's own filter estimates, and corrects; `are_doubtful`:
+    whether the settings say that the scales of the odometry may be wrong."""
     if any(f.used < FEWEST_USED or len(f.used_ns) < LEAST_LANDMARKS for f in filters):
         return None
     # Of few sightings it must be clearer, for what they err by together is hardly known

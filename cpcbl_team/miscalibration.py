@@ -230,7 +230,7 @@ class Rules(NamedTuple):
     knows_covariance: bool = True
     """Whether the covariance is that of the errors. Where it is only larger (`circular`), the size
     of corrections tells nothing, and a constant error must be clearer."""
-    finds_scales: bool = True  # else they are states beside the pose (`scale_errors.py`)
+    finds_scales: bool = True  # else `scale_errors.py` finds them
 
 
 def adapted(

@@ -38,8 +38,9 @@ from cpcbl_team.miscalibration import (
     noise_with_factor,
 )
 from cpcbl_team.motion import NO_VARIANCE, MotionVariance, distance_variance, turn_variance
+from cpcbl_team.parameters import NO_COVARIANCE
 from cpcbl_team.recovery_evidence import SPACING_NS
-from cpcbl_team.scale_errors import NO_OFFSET, ScaleErrors
+from cpcbl_team.scale_errors import ScaleErrors
 from cpcbl_team.second_filters import SecondFilters, has_second_filters, with_adaptation
 from cpcbl_team.self_calibration import ReferencePose, ReferencePoses, self_calibrate
 from cpcbl_team.state import (
@@ -83,7 +84,7 @@ class OwnCalibration:
             return state
         if self._learns:
             learned = memory.learned._replace(
-                distance_variance=scales.first[0], turn_variance=scales.first[1]
+                distance_variance=scales.distance.first, turn_variance=scales.turn.first
             )
             memory = memory._replace(learned=learned)
         return with_calibration(state, memory._replace(scales=scales))
@@ -112,13 +113,13 @@ class OwnCalibration:
 
     def _scales_after_updates(self, state: State) -> tuple[State, ScaleErrors]:
         """What is known of the scales of the odometry after the updates since the last motion; and
-        the state at the pose without the errors of these that are clear now."""
+        the state at the pose without the errors of these that are corrected now."""
         scales, estimate = state.memory.calibration.scales, state.estimate
         if state.lost:
             return state, scales.at_new_pose()
         known = scales.after_updates(estimate, self.filters.estimates_scales)
         known, offset = known.corrected()
-        if offset != NO_OFFSET:
+        if offset != NO_COVARIANCE:
             estimate = estimate._replace(pose=offset_pose(estimate.pose, offset, POSE))
             state = state._replace(estimate=estimate)
         return state, known
@@ -225,7 +226,7 @@ class OwnCalibration:
         scales = memory.scales
         if not scales.are_exact:
             learned = memory.learned
-            scales = scales.with_variances(learned.distance_variance, learned.turn_variance)
+            scales = scales.with_considered(learned.distance_variance, learned.turn_variance)
         return with_calibration(state, memory._replace(scales=scales))
 
     def _after_check(self, state: State) -> State:

@@ -19,7 +19,6 @@ from typing import Final, NamedTuple
 
 from cpcbl_team.estimate import (
     SMALLEST_VARIANCE,
-    ZERO3,
     Covariance3,
     Estimate,
     Row,
@@ -27,11 +26,10 @@ from cpcbl_team.estimate import (
     outer,
     pose_difference,
 )
+from cpcbl_team.parameters import NO_COVARIANCE
 
-INDEPENDENT: Final[Row] = (0.0, 0.0, 0.0)
-NO_OFFSET: Final[Row] = (0.0, 0.0, 0.0)
 LARGEST_LOG: Final = 50.0  # of a ratio of likelihoods
-LEAST_VARIANCE: Final = 0.005**2  # of a share: no floor is alike everywhere
+LEAST_VARIANCE: Final = 0.005**2  # of a share, where one divides by it
 LEAST_SHARE: Final = 0.1**2
 """Of the stated variance of a scale that always stays: no floor is alike everywhere, and wheels
 slip in one curve more than in another."""
@@ -43,70 +41,125 @@ MOST_CHANGE: Final = 0.5  # of a scale at once: what is more is another unit, no
 
 
 class Scale(NamedTuple):
-    """What is known of one scale of the odometry.
+    """What is known of one scale of the odometry, beside what the settings say.
 
-    `factor`: by which its readings are corrected. `error`: the share by which they are too short
-    all the same, as far as that is known; it is not corrected before it is clear. `offset`: what it
-    has moved the pose by (m, m, rad). `covariance`: of the share with (x, y, heading) of the pose.
+    `first`: the variance, as a share, that the settings state; 0: the scale is exact. `variance`:
+    what is left of it by the updates of the pose. `considered`: what the covariance of the pose
+    contains. That does not fall with what is found here: wheels slip in one curve more than in
+    another.
+
+    `factor`: by which readings are corrected. `error`: the share by which they are too short all
+    the same, as far as that is known; as much of it as is likely moves to `factor`. `offset`: what
+    that error has moved the pose by (m, m, rad). `covariance`: of the share with (x, y, heading).
     """
 
+    first: float = 0.0
+    variance: float = 0.0
+    considered: float = 0.0
     factor: float = 1.0
     error: float = 0.0
-    offset: Row = NO_OFFSET
-    covariance: Row = INDEPENDENT
+    offset: Row = NO_COVARIANCE
+    covariance: Row = NO_COVARIANCE
+
+    @staticmethod
+    def of_sigma(sigma: float) -> "Scale":
+        """Of a scale with this sigma, as a share of it."""
+        variance = sigma * sigma
+        return Scale(variance, variance, variance)
+
+    @property
+    def doubt(self) -> Covariance3:
+        """What the covariance of the pose lacks if `error` is there all the same."""
+        _, probability = _mixture(self.factor * (1.0 + self.error) - 1.0, self.variance, self.first)
+        return outer(self.offset).scaled(probability)
+
+    def at_new_pose(self) -> "Scale":
+        """At a pose that does not follow from the odometry until now."""
+        return self._replace(offset=NO_COVARIANCE, covariance=NO_COVARIANCE)
+
+    def after_update(self, inverse: Covariance3, left: Covariance3) -> "Scale":
+        """After an update of the pose, which multiplies its error by 1 - K H = Q P^-1. Both
+        covariances of the pose: the inverse of P, and Q."""
+        return self._replace(
+            offset=left.times(inverse.times(self.offset)),
+            covariance=left.times(inverse.times(self.covariance)),
+        )
+
+    def with_correction(self, before: "Scale", inverse: Covariance3, news: Row) -> "Scale":
+        """With what an update says of it. `before`: the scale before that; `inverse`: of the
+        covariance of the pose then; `news`: the correction of the pose without what was expected.
+        """
+        share = self.variance / max(self.considered, SMALLEST_VARIANCE)
+        of_pose = _times(inverse.times(before.covariance), share)
+        taken = share * dot(of_pose, _plus(before.covariance, self.covariance, -1.0))
+        change = _bounded_change(dot(of_pose, news), taken)
+        variance = max(self.variance - max(taken, 0.0), LEAST_SHARE * self.first)
+        return self._replace(variance=variance, error=self.error + change)
+
+    def corrected(self) -> tuple["Scale", Row]:
+        """With as much of its error corrected as is likely; and what that moves the pose by."""
+        whole = self.factor * (1.0 + self.error)
+        if whole == self.factor:
+            return self, NO_COVARIANCE
+        factor = 1.0 + _mixture(whole - 1.0, self.variance, self.first)[0]
+        share = min(max((factor - self.factor) / (whole - self.factor), -1.0), 1.0)
+        left = _times(self.offset, 1.0 - share)
+        known = self._replace(factor=factor, error=whole / factor - 1.0, offset=left)
+        return known, _times(self.offset, share)
+
+    def after_motion(self, by_share: Row, dx: float, dy: float) -> tuple["Scale", Covariance3]:
+        """After a motion by (dx, dy) in the field's frame, in which a share of one moves the pose
+        by `by_share`; and what that has added to the covariance of the pose."""
+        led = _led(self.covariance, dx, dy)
+        # X g^T + g X^T, of which half of g B g^T is in each
+        added = _symmetric(_plus(led, by_share, 0.5 * self.considered), by_share)
+        known = self._replace(
+            offset=_plus(_led(self.offset, dx, dy), by_share, self.error),
+            covariance=_plus(led, by_share, self.considered),
+        )
+        return known, added
+
+    def pose_offset(self, error: float) -> Row:
+        """By how much (m, m, rad) a share that was too short by this has moved the pose."""
+        return _times(self.covariance, error / max(self.considered, LEAST_VARIANCE))
+
+    def with_considered(self, variance: float) -> "Scale":
+        """With another variance in the covariance of the pose, of which somebody else knows."""
+        k = variance / self.considered if self.considered > 0.0 else 0.0
+        return self._replace(considered=variance, covariance=_times(self.covariance, k))
 
 
 class ScaleErrors(NamedTuple):
-    """What is known of both scales of the odometry, beside what the settings say.
-
-    `variances`: of the shares of distances and turns. `estimate`: of the pose after its last
-    motion, or None before the first one from a pose. `first`: the variances that the settings
-    state; 0: the scales are exact. `considered`: those that the covariance of the pose contains.
-    They do not fall with what is found here: wheels slip in one curve more than in another.
-    """
+    """What is known of both scales of the odometry. `estimate`: of the pose after its last motion,
+    or None before the first one from a pose."""
 
     distance: Scale = Scale()
     turn: Scale = Scale()
-    variances: tuple[float, float] = (0.0, 0.0)
     estimate: Estimate | None = None
-    first: tuple[float, float] = (0.0, 0.0)
-    considered: tuple[float, float] = (0.0, 0.0)
 
     @staticmethod
     def of_sigmas(distance: float, turn: float) -> "ScaleErrors":
         """Of scales with these sigmas, as shares of them."""
-        first = distance * distance, turn * turn
-        return ScaleErrors(variances=first, first=first, considered=first)
+        return ScaleErrors(Scale.of_sigma(distance), Scale.of_sigma(turn))
 
     @property
     def are_exact(self) -> bool:
         """Whether the scales are as the settings say."""
-        return self.first == (0.0, 0.0)
+        return self.distance.first == self.turn.first == 0.0
+
+    @property
+    def factors(self) -> tuple[float, float]:
+        """By which distances and turns are corrected."""
+        return self.distance.factor, self.turn.factor
 
     @property
     def offset(self) -> Row:
         """What errors of the scales that are not corrected have moved the pose by."""
-        return _sum(self.distance.offset, self.turn.offset, 1.0, NO_OFFSET, 0.0)
-
-    @property
-    def doubt(self) -> Covariance3:
-        """What the covariance of the pose lacks if those errors are there all the same."""
-        doubt, variances = ZERO3, self.variances
-        scales = self.distance, self.turn
-        for (factor, error, offset, _), variance, first in zip(
-            scales, variances, self.first, strict=True
-        ):
-            if offset != NO_OFFSET:
-                _, probability = _mixture(factor * (1.0 + error) - 1.0, variance, first)
-                doubt = doubt.plus(outer(offset), probability)
-        return doubt
+        return _plus(self.distance.offset, self.turn.offset)
 
     def at_new_pose(self) -> "ScaleErrors":
         """At a pose that does not follow from the odometry until now."""
-        distance, turn = (
-            s._replace(offset=NO_OFFSET, covariance=INDEPENDENT) for s in (self.distance, self.turn)
-        )
-        return self._replace(distance=distance, turn=turn, estimate=None)
+        return ScaleErrors(self.distance.at_new_pose(), self.turn.at_new_pose())
 
     def after_updates(self, now: Estimate, estimates: bool = True) -> "ScaleErrors":
         """After the updates of the pose since its last motion, that have led to this estimate.
@@ -121,39 +174,25 @@ class ScaleErrors(NamedTuple):
         if not _is_smaller(left, covariance):
             return self._bounded(left)
         inverse = covariance.inverse()
-        distance, turn = (_after_update(s, inverse, left) for s in (self.distance, self.turn))
-        known = self._replace(distance=distance, turn=turn, estimate=now)
+        distance, turn = (s.after_update(inverse, left) for s in (self.distance, self.turn))
+        known = ScaleErrors(distance, turn, now)
         if estimates and covariance.hh <= MOST_HEADING_VARIANCE:
-            known = self._with_correction(known, inverse, pose_difference(before.pose, now.pose))
-        return known._bounded(left)
-
-    def _with_correction(
-        self, after: "ScaleErrors", inverse: Covariance3, correction: Row
-    ) -> "ScaleErrors":
-        """With what this correction of the pose says of both scales. `inverse`: of its covariance
-        before that."""
-        parts = []
-        for i, (scale, now) in enumerate(zip(self[:2], after[:2], strict=True)):
-            share = self.variances[i] / max(self.considered[i], SMALLEST_VARIANCE)
-            of_pose = _scaled(inverse.times(scale.covariance), share)
-            taken = share * dot(of_pose, _difference(scale.covariance, now.covariance))
             # What is known already to be wrong with the pose was expected
-            expected = _difference(self.offset, after.offset)
-            change = _bounded_change(dot(of_pose, _difference(correction, expected)), taken)
-            variance = _left_of(self.variances[i], taken, self.first[i])
-            parts.append((now._replace(error=now.error + change), variance))
-        (distance, of_distance), (turn, of_turn) = parts
-        return after._replace(distance=distance, turn=turn, variances=(of_distance, of_turn))
+            expected = _plus(self.offset, known.offset, -1.0)
+            news = _plus(pose_difference(before.pose, now.pose), expected, -1.0)
+            distance = distance.with_correction(self.distance, inverse, news)
+            turn = turn.with_correction(self.turn, inverse, news)
+            known = ScaleErrors(distance, turn, now)
+        return known._bounded(left)
 
     def corrected(self) -> tuple["ScaleErrors", Row]:
         """With their errors corrected, as far as these are likely; and what that moves the pose
         by."""
-        distance, by_distance = _corrected(self.distance, self.variances[0], self.first[0])
-        turn, by_turn = _corrected(self.turn, self.variances[1], self.first[1])
+        distance, by_distance = self.distance.corrected()
+        turn, by_turn = self.turn.corrected()
         if distance is self.distance and turn is self.turn:
-            return self, NO_OFFSET
-        known = self._replace(distance=distance, turn=turn)
-        return known, _sum(by_distance, by_turn, 1.0, NO_OFFSET, 0.0)
+            return self, NO_COVARIANCE
+        return ScaleErrors(distance, turn, self.estimate), _plus(by_distance, by_turn)
 
     def after_motion(
         self, before: Estimate, distance: float, turn: float
@@ -162,55 +201,28 @@ class ScaleErrors(NamedTuple):
         what the scales have added to the covariance of the pose in it."""
         direction = before.pose.heading + 0.5 * turn
         dx, dy = distance * cos(direction), distance * sin(direction)
-        # A share of one moves the pose by `g`, and a pose that is turned leads aside
-        g_distance, g_turn = (dx, dy, 0.0), (-0.5 * turn * dy, 0.5 * turn * dx, turn)
-        (_, error, off, of_distance), (_, turn_error, turn_off, of_turn) = self[:2]
-        led_distance, led_turn = _led(of_distance, dx, dy), _led(of_turn, dx, dy)
-        dd, tt = self.considered
-        by_distance = self.distance._replace(
-            offset=_sum(_led(off, dx, dy), g_distance, error, NO_OFFSET, 0.0),
-            covariance=_sum(led_distance, g_distance, dd, NO_OFFSET, 0.0),
-        )
-        by_turn = self.turn._replace(
-            offset=_sum(_led(turn_off, dx, dy), g_turn, turn_error, NO_OFFSET, 0.0),
-            covariance=_sum(led_turn, g_turn, tt, NO_OFFSET, 0.0),
-        )
-        # X g^T + g X^T of both, of which half of g B g^T is in each
-        added = _symmetric(
-            (_sum(led_distance, g_distance, 0.5 * dd, NO_OFFSET, 0.0), g_distance),
-            (_sum(led_turn, g_turn, 0.5 * tt, NO_OFFSET, 0.0), g_turn),
-        )
-        return self._replace(distance=by_distance, turn=by_turn), added
+        of_distance, added = self.distance.after_motion((dx, dy, 0.0), dx, dy)
+        by_turn = -0.5 * turn * dy, 0.5 * turn * dx, turn
+        of_turn, more = self.turn.after_motion(by_turn, dx, dy)
+        return ScaleErrors(of_distance, of_turn, self.estimate), added.plus(more)
 
     def pose_offset(self, now: Estimate, distance: float, turn: float) -> Row:
         """By how much (m, m, rad) shares that were too short by this have moved the pose. The
         scales are only considered."""
-        xx, yy = self.considered
-        by_distance, by_turn, *_ = self.after_updates(now, estimates=False)
-        k, m = distance / max(xx, LEAST_VARIANCE), turn / max(yy, LEAST_VARIANCE)
-        return _sum(INDEPENDENT, by_distance.covariance, k, by_turn.covariance, m)
+        known = self.after_updates(now, estimates=False)
+        return _plus(known.distance.pose_offset(distance), known.turn.pose_offset(turn))
 
-    def with_variances(self, distance: float, turn: float) -> "ScaleErrors":
+    def with_considered(self, distance: float, turn: float) -> "ScaleErrors":
         """With other variances in the covariance of the pose, of which somebody else knows."""
-        xx, yy = self.considered
-        k = distance / xx if xx > 0.0 else 0.0
-        m = turn / yy if yy > 0.0 else 0.0
-        return self._scaled(k, m)._replace(considered=(distance, turn))
-
-    def _scaled(self, k: float, m: float) -> "ScaleErrors":
-        """With covariances of distances and turns with the pose times these factors."""
-        distance, turn, *_ = self
-        return self._replace(
-            distance=distance._replace(covariance=_scaled(distance.covariance, k)),
-            turn=turn._replace(covariance=_scaled(turn.covariance, m)),
-        )
+        of_distance = self.distance.with_considered(distance)
+        return ScaleErrors(of_distance, self.turn.with_considered(turn), self.estimate)
 
     def _bounded(self, left: Covariance3) -> "ScaleErrors":
         """Where something else has changed the covariance of the pose: no more of it than the whole
         is due to the scales."""
-        xx, yy = [max(variance, LEAST_VARIANCE) for variance in self.considered]
-        inverse = left.inverse()
-        of_distance, of_turn = self.distance.covariance, self.turn.covariance
+        inverse, (distance, turn, _) = left.inverse(), self
+        of_distance, of_turn = distance.covariance, turn.covariance
+        xx, yy = max(distance.considered, LEAST_VARIANCE), max(turn.considered, LEAST_VARIANCE)
         a, b = (
             dot(inverse.times(of_distance), of_distance),
             dot(inverse.times(of_distance), of_turn),
@@ -221,30 +233,22 @@ class ScaleErrors(NamedTuple):
         if largest <= 1.0:
             return self
         k = 1.0 / sqrt(largest)
-        return self._scaled(k, k)
+        return self._replace(
+            distance=distance._replace(covariance=_times(of_distance, k)),
+            turn=turn._replace(covariance=_times(of_turn, k)),
+        )
 
 
 EXACT: Final = ScaleErrors()
 
 
-def _after_update(scale: Scale, inverse: Covariance3, left: Covariance3) -> Scale:
-    """A scale after an update of the pose, which multiplies its error by 1 - K H = Q P^-1. Both
-    covariances of the pose: the inverse of P, and Q."""
-    factor, error, offset, covariance = scale
-    offset = left.times(inverse.times(offset))
-    return Scale(factor, error, offset, left.times(inverse.times(covariance)))
-
-
-def _corrected(scale: Scale, variance: float, first: float) -> tuple[Scale, Row]:
-    """A scale of which as much is corrected as `_mixture` says, and what moves the pose."""
-    factor, error, offset, covariance = scale
-    whole = factor * (1.0 + error)
-    if whole == factor:
-        return scale, NO_OFFSET
-    corrected = 1.0 + _mixture(whole - 1.0, variance, first)[0]
-    share = min(max((corrected - factor) / (whole - factor), -1.0), 1.0)
-    left = Scale(corrected, whole / corrected - 1.0, _scaled(offset, 1.0 - share), covariance)
-    return left, _scaled(offset, share)
+def with_scales_doubted(estimate: Estimate, scales: ScaleErrors) -> Estimate:
+    """The estimate as it is if errors of the scales that are not corrected are there."""
+    for scale in (scales.distance, scales.turn):
+        if scale.offset != NO_COVARIANCE:
+            covariance = estimate.covariance.plus(scale.doubt)
+            estimate = estimate._replace(covariance=covariance)
+    return estimate
 
 
 def _mixture(error: float, variance: float, first: float) -> tuple[float, float]:
@@ -269,11 +273,6 @@ def _bounded_change(change: float, taken: float) -> float:
     return min(max(change, -most), most)
 
 
-def _left_of(variance: float, taken: float, first: float) -> float:
-    """The variance of a scale after an update; `first`: of the settings."""
-    return max(variance - max(taken, 0.0), LEAST_SHARE * first)
-
-
 def _is_smaller(covariance: Covariance3, before: Covariance3) -> bool:
     """Whether an update has made a covariance smaller; else something has made it larger."""
     is_smaller = covariance.xx + covariance.yy <= before.xx + before.yy
@@ -286,31 +285,23 @@ def _led(row: Row, dx: float, dy: float) -> Row:
     return x - dy * heading, y + dx * heading, heading
 
 
-def _difference(one: Row, other: Row) -> Row:
-    return one[0] - other[0], one[1] - other[1], one[2] - other[2]
+def _plus(row: Row, other: Row, k: float = 1.0) -> Row:
+    """row + k other."""
+    return row[0] + k * other[0], row[1] + k * other[1], row[2] + k * other[2]
 
 
-def _scaled(row: Row, k: float) -> Row:
+def _times(row: Row, k: float) -> Row:
     return k * row[0], k * row[1], k * row[2]
 
 
-def _sum(row: Row, one: Row, k: float, other: Row, m: float) -> Row:
-    """row + k one + m other."""
-    return (
-        row[0] + k * one[0] + m * other[0],
-        row[1] + k * one[1] + m * other[1],
-        row[2] + k * one[2] + m * other[2],
-    )
-
-
-def _symmetric(first: tuple[Row, Row], second: tuple[Row, Row]) -> Covariance3:
-    """The sum of a b^T + b a^T of both pairs."""
-    (a, b), (c, d) = first, second
+def _symmetric(a: Row, b: Row) -> Covariance3:
+    """a b^T + b a^T."""
+    (ax, ay, ah), (bx, by, bh) = a, b
     return Covariance3(
-        2.0 * (a[0] * b[0] + c[0] * d[0]),
-        a[0] * b[1] + a[1] * b[0] + c[0] * d[1] + c[1] * d[0],
-        2.0 * (a[1] * b[1] + c[1] * d[1]),
-        a[0] * b[2] + a[2] * b[0] + c[0] * d[2] + c[2] * d[0],
-        a[1] * b[2] + a[2] * b[1] + c[1] * d[2] + c[2] * d[1],
-        2.0 * (a[2] * b[2] + c[2] * d[2]),
+        2.0 * ax * bx,
+        ax * by + ay * bx,
+        2.0 * ay * by,
+        ax * bh + ah * bx,
+        ay * bh + ah * by,
+        2.0 * ah * bh,
     )

@@ -24,7 +24,7 @@ from cpcbl_team.common_errors import CommonErrors
 from cpcbl_team.config import Field, LocalizationSettings
 from cpcbl_team.constant_errors import pose_offset
 from cpcbl_team.estimate import POSE, Estimate, offset_pose
-from cpcbl_team.filter_corrections import Estimated, correction
+from cpcbl_team.filter_corrections import KindsOfError, correction
 from cpcbl_team.landmarks import Landmarks
 from cpcbl_team.lost_reasons import no_longer_lost
 from cpcbl_team.miscalibration import AS_CONFIGURED, Adaptation, ModelCheck, errors_between
@@ -81,7 +81,7 @@ class SecondFilters:
         if self.scales.are_exact or (self.estimates_scales and not memory.filters):
             return state
         scales = memory.scales.after_updates(state.estimate, self.estimates_scales)
-        scales = scales.with_variances(*scale_variances(memory.filters, self.scales))
+        scales = scales.with_considered(*scale_variances(memory.filters, self.scales))
         return with_calibration(state, memory._replace(scales=scales))
 
     def without_adaptation(self, state: State) -> State:
@@ -115,8 +115,8 @@ class SecondFilters:
         changed = self._correction(state, filters)
         if changed is None:
             estimate, place = state.estimate, state.odometry_from_robot
-            estimated = self._estimated(state)
-            filters = with_probabilities(filters, present, estimate, place, estimated)
+            considered = KindsOfError(not self.scales.are_exact, memory.common is not None)
+            filters = with_probabilities(filters, present, estimate, place, considered)
             return with_calibration(state, memory._replace(filters=filters))
         is_first = present.bearing_bias_rad == 0.0 != changed.bearing_bias_rad
         is_first |= present.ranges == NO_RANGE_ERRORS != changed.ranges
@@ -141,13 +141,10 @@ class SecondFilters:
         """What these filters are sure of; None if it changes nothing."""
         if not self._may_correct(state):
             return None
-        present = state.memory.calibration.adaptation
-        return correction(filters, present, self._estimated(state), not self.scales.are_exact)
-
-    def _estimated(self, state: State) -> Estimated:
-        """Which errors the robot's own filter estimates with the pose."""
-        are_scales = self.estimates_scales and not self.scales.are_exact
-        return Estimated(are_scales, state.common_errors is not None)
+        present, are_doubtful = state.memory.calibration.adaptation, not self.scales.are_exact
+        are_estimated = self.estimates_scales and are_doubtful
+        estimated = KindsOfError(are_estimated, state.common_errors is not None)
+        return correction(filters, present, estimated, are_doubtful)
 
     def _may_correct(self, state: State) -> bool:
         """Whether wrong settings may be corrected: a wrong distance between the only two landmarks
@@ -169,8 +166,8 @@ class SecondFilters:
             if begin is None:
                 return ()
             first = CalibrationFilter.at(now_ns, place, begin, gaps, self._first_sigmas)
-            return (first._replace(scales=_scales_of(memory)),) * FILTERS
-        filters = tuple([f.for_scales(*_scales_of(memory)) for f in filters])
+            return (first._replace(scales=memory.scales.factors),) * FILTERS
+        filters = tuple([f.for_scales(*memory.scales.factors) for f in filters])
         is_broken = gaps > filters[0].gaps or now_ns - filters[0].stamp_ns > LONGEST_NS
         is_broken |= odometry is not None and until_ns < now_ns
         if is_broken:
@@ -218,11 +215,6 @@ class SecondFilters:
             seen = SeenLandmark(name, x, y, range_m, bearing, sigma_m * sigma_m, variance)
             frames.setdefault(stamp_ns, Frame(stamp_ns, place, [])).seen.append(seen)
         return sorted(frames.values())
-
-
-def _scales_of(memory: CalibrationMemory) -> tuple[float, float]:
-    """Of distances and turns, as the robot's own filter estimates them."""
-    return memory.scales.distance.factor, memory.scales.turn.factor
 
 
 def has_second_filters(common: CommonErrors | None) -> bool:

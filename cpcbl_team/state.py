@@ -20,6 +20,7 @@ from cpcbl_team.estimate import HEADING, POSE, POSITION, ZERO3, Covariance3, Est
 from cpcbl_team.geometry import Pose2, new, wrap_angle
 from cpcbl_team.inputs import Belief, LandmarkBelief, Odometry, Sighting
 from cpcbl_team.miscalibration import with_doubts
+from cpcbl_team.scale_errors import with_scales_doubted
 from cpcbl_team.sender_records import SenderRecord
 
 FIX = "fix:"  # marks the source of an active fix, apart from a sighting of that teammate
@@ -192,8 +193,7 @@ class State(NamedTuple):
         """The estimate as it is belief to others: as uncertain as the settings are, too."""
         known = self.memory.calibration
         estimate = with_doubts(with_arc_width(self.estimate), known.check)
-        if (doubt := known.scales.doubt) is not ZERO3:
-            estimate = estimate._replace(covariance=estimate.covariance.plus(doubt))
+        estimate = with_scales_doubted(estimate, known.scales)
         return with_doubt(estimate, self.odometry_from_robot, known.filters, known.adaptation)
 
     @property

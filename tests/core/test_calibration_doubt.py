@@ -28,6 +28,7 @@ from cpcbl_team.calibration_doubt import (
 from cpcbl_team.calibration_filter import FILTERS, FIRST_SIGMAS, CalibrationFilter
 from cpcbl_team.config import SensorSettings
 from cpcbl_team.estimate import Covariance3, Estimate
+from cpcbl_team.filter_corrections import KindsOfError
 from cpcbl_team.geometry import Pose2
 from cpcbl_team.inputs import Sighting
 from cpcbl_team.miscalibration import AS_CONFIGURED, Adaptation
@@ -92,6 +93,25 @@ def test_errors_that_are_corrected_are_not_doubted() -> None:
     filters = (knowing(errors, after),) * FILTERS
     assert probability(with_probabilities(filters, AS_CONFIGURED, OWN, HERE)) == pytest.approx(1.0)
     assert probability(with_probabilities(filters, corrected, OWN, HERE)) == 0.0
+
+
+def test_errors_that_the_covariance_contains_are_not_doubted() -> None:
+    after = 1e-4 * np.eye(3)
+    of_bearings = (knowing(np.array([0.1, 0.0, 0.0]), after),) * FILTERS
+    known = knowing(np.zeros(3), after)
+    rows = [list(row) for row in known.covariance]
+    rows[6][6] = 1e-4
+    errors = (*known.errors[:3], 0.2, 0.0)
+    of_scales = (known._replace(errors=errors, covariance=tuple(map(tuple, rows))),) * FILTERS
+    bearing_bias, scales = KindsOfError(False, True), KindsOfError(True, False)
+    for filters, is_considered, other in (
+        (of_bearings, bearing_bias, scales),
+        (of_scales, scales, bearing_bias),
+    ):
+        found = with_probabilities(filters, AS_CONFIGURED, OWN, HERE, other)
+        assert probability(found) > 0.9
+        found = with_probabilities(filters, AS_CONFIGURED, OWN, HERE, is_considered)
+        assert probability(found) == 0.0
 
 
 def test_rounding_is_no_evidence() -> None:

@@ -36,7 +36,8 @@ from cpcbl_team.geometry import Pose2, step
 from cpcbl_team.inputs import InitialPose, InputsMended, Odometry
 from cpcbl_team.localizer import Localizer
 from cpcbl_team.motion import motion_jacobian, motion_noise, move
-from cpcbl_team.scale_errors import EXACT, INDEPENDENT, ScaleErrors
+from cpcbl_team.parameters import NO_COVARIANCE
+from cpcbl_team.scale_errors import EXACT, ScaleErrors
 from cpcbl_team.state import State, with_calibration
 
 NOISE = OdometryNoise()
@@ -123,7 +124,8 @@ def test_one_update_says_of_the_scales_what_a_filter_with_five_states_says() -> 
     pose = offset_pose(estimate.pose, (x, y, heading), POSE)
     known = scales.after_updates(Estimate(pose, covariance3(left[:3, :3])))
     assert (known.distance.error, known.turn.error) == pytest.approx(mean[3:], abs=1e-12)
-    assert known.variances == pytest.approx(np.diag(left)[3:], abs=1e-12)
+    variances = known.distance.variance, known.turn.variance
+    assert variances == pytest.approx(np.diag(left)[3:], abs=1e-12)
 
 
 def test_an_error_that_is_expected_is_no_news() -> None:
@@ -141,7 +143,7 @@ def test_an_error_that_is_expected_is_no_news() -> None:
     known = scales.after_updates(Estimate(pose, covariance3(left)))
     assert known.turn.error == pytest.approx(0.05)
     assert known.distance.error == pytest.approx(0.0, abs=1e-12)
-    assert known.variances[1] < scales.variances[1]
+    assert known.turn.variance < scales.turn.variance
 
 
 @given(
@@ -172,7 +174,7 @@ def test_covariance_stays_one_whatever_happens(
         whole[:3, :3] = matrix3(estimate.covariance)
         whole[3, :3] = whole[:3, 3] = known.distance.covariance
         whole[4, :3] = whole[:3, 4] = known.turn.covariance
-        whole[3:, 3:] = np.diag(known.considered)
+        whole[3:, 3:] = np.diag([known.distance.considered, known.turn.considered])
         size = float(np.trace(whole))
         assert least_eigenvalue(whole) > -1e-9 * max(size, 1.0)
         assert 0.0 < known.distance.factor < math.inf
@@ -200,9 +202,9 @@ def test_a_scale_that_is_exact_stays_so() -> None:
     now = Estimate(Pose2(x + 0.1, y, heading + 0.05), covariance.scaled(0.5))
     known = scales.after_updates(now)
     assert known.distance.error == 0.0
-    assert known.variances[0] == 0.0
+    assert known.distance.variance == 0.0
     assert known.turn.error > 0.0
-    assert known.variances[1] < 0.2**2
+    assert known.turn.variance < 0.2**2
 
 
 def test_a_correction_of_another_size_changes_a_scale_by_three_sigma_at_most() -> None:
@@ -243,11 +245,11 @@ def test_variants_of_the_paper_take_scales_for_exact(rules: LocalizerSettings) -
 def test_a_pose_that_somebody_sets_owes_nothing_to_the_way_to_it() -> None:
     robot = robot_of()
     state = driven_blind(robot.start(0), robot, 50)
-    assert state.memory.calibration.scales.distance.covariance != INDEPENDENT
+    assert state.memory.calibration.scales.distance.covariance != NO_COVARIANCE
     covariance = 0.01, 0.0, 0.01, 0.0, 0.0, 0.01
     given = InitialPose(state.stamp_ns, 1.0, 1.0, 0.0, covariance)
     known = robot.set_pose(state, given).memory.calibration.scales
-    assert known.distance.covariance == known.turn.covariance == INDEPENDENT
+    assert known.distance.covariance == known.turn.covariance == NO_COVARIANCE
     assert known.estimate is None
 
 
@@ -257,8 +259,8 @@ def test_a_robot_that_stands_moves_to_where_its_scales_say() -> None:
     robot = robot_of()
     state = driven_blind(robot.start(0), robot, 50)
     memory = state.memory.calibration
-    turn = memory.scales.turn._replace(error=0.1, offset=(0.3, 0.2, 0.1))
-    known = memory.scales._replace(turn=turn, variances=(1e-4, 1e-4))
+    turn = memory.scales.turn._replace(error=0.1, offset=(0.3, 0.2, 0.1), variance=1e-4)
+    known = memory.scales._replace(turn=turn)
     state = with_calibration(state, memory._replace(scales=known))
     now = state.stamp_ns
     standing = robot.add_odometry(state, Odometry(now, now + PIECE_NS, 0.0, 0.0))
@@ -339,5 +341,5 @@ def test_scales_are_known_after_some_time_among_landmarks() -> None:
     scales = state.memory.calibration.scales
     assert scales.distance.factor == pytest.approx(1.15, abs=0.03)
     assert scales.turn.factor == pytest.approx(0.7, abs=0.03)
-    assert math.sqrt(scales.variances[0]) < 0.02
-    assert math.sqrt(scales.variances[1]) < 0.025
+    assert math.sqrt(scales.distance.variance) < 0.02
+    assert math.sqrt(scales.turn.variance) < 0.025
