@@ -119,6 +119,8 @@ class OwnCalibration:
             return state, scales.at_new_pose()
         known = scales.after_updates(estimate, self.filters.estimates_scales)
         known, offset = known.corrected()
+        if known.contradict_settings and not scales.contradict_settings:
+            state = state.counted("miscalibrated")
         if offset != NO_COVARIANCE:
             estimate = estimate._replace(pose=offset_pose(estimate.pose, offset, POSE))
             state = state._replace(estimate=estimate)
@@ -187,8 +189,13 @@ class OwnCalibration:
         return self.filters.after_block(state)
 
     def without_adaptation(self, state: State) -> State:
-        """The state without what the robot noticed of its settings and of its map so far."""
-        return self.filters.without_adaptation(state)
+        """The state without what the robot noticed of its settings and of its map so far, for its
+        inputs were wrong."""
+        state = self.filters.without_adaptation(state)
+        memory = state.memory.calibration
+        # Those of a robot that calibrates itself are what it has learned before
+        scales = memory.scales if self._learns else self.filters.scales
+        return with_calibration(state, memory._replace(scales=scales))
 
     def _with_residuals(self, state: State) -> State:
         """The state that has compared what it read of landmarks with the map, once a block in which

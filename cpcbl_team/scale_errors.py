@@ -36,6 +36,7 @@ slip in one curve more than in another."""
 MOST_SIGMAS: Final = 3.0  # by which one correction of the pose changes a scale
 ODDS: Final = 0.25  # of wheels of another day to those of the calibration
 SAME_DAY: Final = 0.1**2  # the variance of the scales on its days, as a share of the stated one
+SETTINGS_SIGMAS: Final = 3.0  # of the stated sigma; beyond, the settings do not explain a scale
 MOST_HEADING_VARIANCE: Final = 1.0**2  # rad^2: beyond, no way is as straight as its linear form
 MOST_CHANGE: Final = 0.5  # of a scale at once: what is more is another unit, no other tyre
 
@@ -66,6 +67,12 @@ class Scale(NamedTuple):
         """Of a scale with this sigma, as a share of it."""
         variance = sigma * sigma
         return Scale(variance, variance, variance)
+
+    @property
+    def contradicts_settings(self) -> bool:
+        """Whether it is corrected by more than its settings explain (3 sigma)."""
+        change = self.factor - 1.0
+        return change * change > SETTINGS_SIGMAS**2 * self.first
 
     @property
     def doubt(self) -> Covariance3:
@@ -146,6 +153,11 @@ class ScaleErrors(NamedTuple):
     def are_exact(self) -> bool:
         """Whether the scales are as the settings say."""
         return self.distance.first == self.turn.first == 0.0
+
+    @property
+    def contradict_settings(self) -> bool:
+        """Whether one of them is corrected by more than its settings explain."""
+        return self.distance.contradicts_settings or self.turn.contradicts_settings
 
     @property
     def factors(self) -> tuple[float, float]:

@@ -4,6 +4,7 @@ import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Literal, NamedTuple, Protocol
 
+from cpcbl_team.miscalibration import LEAST_BIAS_RAD, LEAST_SCALE
 from cpcbl_team.misplacements import MISPLACED, MOVES, REJECTED
 from cpcbl_team.moved_landmarks import MOST_MOVES
 from cpcbl_transport.messages import Status, Track
@@ -119,9 +120,13 @@ def distrust_text(trust: Iterable[Judged]) -> str:
     return "; ".join(texts)
 
 
-def miscalibration_text(counts: Mapping[str, int], learned: object | None) -> str:
+def miscalibration_text(
+    counts: Mapping[str, int], learned: tuple[float, float, float] | None
+) -> str:
     """`σ of its odometry × 2.1, 13.0% of observations rejected`: why a robot is called
-    miscalibrated; empty if it is not, or no longer. Scales that it has `learned` are not in it."""
+    miscalibrated; empty if it is not, or no longer. `learned`: the scales of distances and turns
+    and the bias of bearings (rad) by which it corrects its readings now; they are not in the text.
+    """
     texts = [
         f"σ of its {what} × {counts[name] / 100.0:.1f}"
         for what in ("odometry", "sensor")
@@ -134,11 +139,20 @@ def miscalibration_text(counts: Mapping[str, int], learned: object | None) -> st
         for sign, word in (("+", "plus"), ("-", "minus"))
         if (name := f"range_{word}_mm") in counts
     ]
-    if not counts.get("miscalibrated") or not (texts or learned):
+    if not counts.get("miscalibrated") or not (texts or _is_worth_saying(learned)):
         return ""
     used, rejected = counts.get("accepted", 0), counts.get("gated", 0)
     texts.append(f"{rejected / max(used + rejected, 1):.1%} of observations rejected")
     return ", ".join(texts)
+
+
+def _is_worth_saying(learned: tuple[float, float, float] | None) -> bool:
+    """Whether somebody should calibrate the robot because of these corrections."""
+    if learned is None:
+        return False
+    *scales, bias_rad = learned
+    is_off = any(abs(scale - 1.0) >= LEAST_SCALE for scale in scales)
+    return is_off or abs(bias_rad) >= LEAST_BIAS_RAD
 
 
 def learned_text(distance_scale: float, turn_scale: float, bearing_bias_deg: float) -> str:

@@ -328,9 +328,9 @@ def test_without_it_a_robot_is_sure_of_a_wrong_pose() -> None:
     assert np.mean([f.nees for f in figures]) > 6.0
 
 
-def test_scales_are_known_after_some_time_among_landmarks() -> None:
-    """Wheels that drive 1.15 of each distance, and turn 0.7 of each turn."""
-    robot, pose, rng = robot_of(), Pose2(0.0, -1.2, 0.0), np.random.default_rng(5)
+def after_driving_among_landmarks(robot: Localizer) -> State:
+    """After 90 s with wheels that drive 1.15 of each distance, and turn 0.7 of each turn."""
+    pose, rng = Pose2(0.0, -1.2, 0.0), np.random.default_rng(5)
     state, errors = robot.start(0), sensor_noise(np.random.default_rng(6), SENSOR)
     for _ in range(900):
         distance, turn = 1.15 * ARC[0], 0.7 * ARC[1]
@@ -338,8 +338,28 @@ def test_scales_are_known_after_some_time_among_landmarks() -> None:
         pose, now = displaced(step(pose, distance, turn), noise, rng), state.stamp_ns
         state = robot.add_odometry(state, Odometry(now, now + PIECE_NS, *ARC))
         state = robot.cycle(state, frame(pose, now + PIECE_NS, noise=errors))
+    return state
+
+
+def test_scales_are_known_after_some_time_among_landmarks() -> None:
+    """The settings explain them, so the robot is not called miscalibrated."""
+    state = after_driving_among_landmarks(robot_of())
     scales = state.memory.calibration.scales
     assert scales.distance.factor == pytest.approx(1.15, abs=0.03)
     assert scales.turn.factor == pytest.approx(0.7, abs=0.03)
     assert math.sqrt(scales.distance.variance) < 0.02
     assert math.sqrt(scales.turn.variance) < 0.025
+    assert "miscalibrated" not in state.counts
+
+
+def test_scales_that_the_settings_do_not_explain_are_counted() -> None:
+    state = after_driving_among_landmarks(robot_of(sigmas=(0.04, 0.08)))
+    assert state.memory.calibration.scales.turn.factor == pytest.approx(0.7, abs=0.05)
+    assert state.counts["miscalibrated"]
+
+
+def test_what_wrong_inputs_said_of_the_scales_is_forgotten() -> None:
+    robot = robot_of()
+    state = after_driving_among_landmarks(robot)
+    mended = robot.forget_wrong_inputs(state, InputsMended(state.stamp_ns))
+    assert mended.memory.calibration.scales == ScaleErrors.of_sigmas(*SIGMAS)

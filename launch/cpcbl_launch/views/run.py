@@ -283,10 +283,14 @@ def _remarks(report: Report, is_wide: bool) -> Iterator[str]:
         elif not r.has_data:
             yield f"Robot {name} received no input: neither odometry nor sightings nor a position."
     for name, r in report.robots.items():
+        learned = None
         if (own := r.learned) is not None:  # what is done to readings
             text = learned_text(own.distance_scale, own.turn_scale, own.bearing_bias_deg)
-            yield f"Robot {name} calibrated itself: {text}."
-        if text := miscalibration_text(r.counts, r.learned):
+            if text != learned_text(1.0, 1.0, 0.0):
+                yield f"Robot {name} calibrated itself: {text}."
+            bias_rad = math.radians(own.bearing_bias_deg)
+            learned = own.distance_scale, own.turn_scale, bias_rad
+        if text := miscalibration_text(r.counts, learned):
             yield f"Robot {name} is miscalibrated: {text}. Run `cpcbl-team calibrate`."
         for place, text in misplaced_objects(r.counts).items():
             yield f"Robot {name} finds {place} elsewhere than {text}. Measure its place again."

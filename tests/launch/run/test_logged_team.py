@@ -341,6 +341,8 @@ def test_a_robot_whose_settings_fit_again_is_not_called_miscalibrated() -> None:
     assert miscalibration_text(counts, None) == ""
     assert miscalibration_text(counts | {"odometry_sigma_percent": 210}, None) != ""
     assert miscalibration_text(counts, (0.9, 1.0, 0.0)) == "1.5% of observations rejected"
+    assert miscalibration_text(counts, (0.99, 1.01, -0.01)) == ""  # as any robot that drives
+    assert miscalibration_text(counts, (1.0, 1.0, -0.05)) != ""
 
 
 def test_an_evaluation_can_stop_early(tmp_path: Path) -> None:
