@@ -128,7 +128,10 @@ def _is_singular(c: Covariance3) -> bool:
 
 
 def _contradict(filters: Filters, estimate: Estimate, place: Pose2) -> bool:
-    """Whether the robot is elsewhere by all these filters, and at one place."""
+    """Whether the robot is elsewhere by all these filters, and at one place. Filters that only
+    follow the odometry contradict nobody: the robot may know better by its teammates."""
+    if any(f.is_blind for f in filters):
+        return False
     known = [f.estimate_at(place, estimate) for f in filters]
     return all(_are_apart(k, estimate) and not _are_apart(k, known[0]) for k in known)
 

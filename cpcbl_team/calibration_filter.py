@@ -44,6 +44,7 @@ POSITION_VARIANCE, HEADING_VARIANCE = 0.5**2, math.radians(20.0) ** 2
 SPACING_NS: Final = 1_000_000_000  # between two sightings of a landmark
 LONGEST_NS: Final = 10_000_000_000  # between two frames: of a longer way the path matters
 STRIDE_NS: Final = 3_000_000_000  # without sightings it follows the odometry in such steps
+BLIND_NS: Final = 60_000_000_000  # without sightings, after which its way is not known well
 GATE: Final = 16.0  # chi-square of a sighting; 0.03 % of correct ones are beyond
 MOST_REJECTED: Final = 8  # in a row; then the filter begins anew
 FADING: Final = 0.99  # of the sum of the chi-squares, a sighting
@@ -127,8 +128,14 @@ class CalibrationFilter(NamedTuple):
             pose=estimate.pose,
             covariance=_tuples(rows),
             rejected=0,
+            probability=0.0,
             gaps=gaps,
         )
+
+    @property
+    def is_blind(self) -> bool:
+        """Whether it has used no landmark for so long that it only follows the odometry."""
+        return self.stamp_ns - max(self.used_ns.values(), default=-BLIND_NS) > BLIND_NS
 
     def after(
         self,

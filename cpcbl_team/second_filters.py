@@ -176,12 +176,14 @@ class SecondFilters:
         frames = self._frames_since(state, filters[0].stamp_ns)
         if not frames or frames[-1].stamp_ns < now_ns:
             frames.append(Frame(now_ns, place, []))
-        return tuple(
-            [
-                f.after(frames, self._noise, self._correlation_s, self._left_out[i])
-                for i, f in enumerate(filters)
-            ]
-        )
+        after = [
+            f.after(frames, self._noise, self._correlation_s, self._left_out[i])
+            for i, f in enumerate(filters)
+        ]
+        if not is_known:
+            return tuple(after)
+        of_blind = now_ns, place, estimate, gaps
+        return tuple([f.with_pose(*of_blind) if f.is_blind else f for f in after])
 
     def _rough_estimate(self, state: State) -> Estimate | None:
         """Where a lost robot is if its ranges are hardly known; None if that determines no pose, or

@@ -10,6 +10,7 @@ from support.core import (
     SECOND,
     Noise,
     diagonal,
+    fix,
     followed,
     localizer,
     loop,
@@ -26,11 +27,11 @@ from cpcbl_team.calibration_doubt import (
     with_remaining_errors,
 )
 from cpcbl_team.calibration_filter import FILTERS, FIRST_SIGMAS, CalibrationFilter
-from cpcbl_team.config import SensorSettings
+from cpcbl_team.config import OdometrySettings, SensorSettings
 from cpcbl_team.estimate import Covariance3, Estimate
 from cpcbl_team.filter_corrections import KindsOfError
-from cpcbl_team.geometry import Pose2
-from cpcbl_team.inputs import Sighting
+from cpcbl_team.geometry import Pose2, step
+from cpcbl_team.inputs import Odometry, Sighting
 from cpcbl_team.miscalibration import AS_CONFIGURED, Adaptation
 from cpcbl_team.range_errors import NO_RANGE_ERRORS, RangeErrors
 
@@ -201,6 +202,34 @@ def test_a_pose_that_a_filter_contradicts_is_as_likely_wrong_as_the_settings() -
         own = Estimate(Pose2(x, 0.0, 0.0), diagonal(0.1, 0.1))
         (found,) = with_probabilities((known,), AS_CONFIGURED, own, HERE)
         assert found.probability == expected
+
+
+def test_a_filter_that_only_follows_the_odometry_contradicts_nobody() -> None:
+    known = knowing(np.zeros(3), np.diag(np.square(FIRST_SIGMAS[:3])))
+    own = Estimate(Pose2(1.5, 0.0, 0.0), diagonal(0.1, 0.1))
+    used = known._replace(stamp_ns=61 * SECOND, used_ns={"a": 2 * SECOND})
+    for f, expected in ((used, 0.5), (used._replace(stamp_ns=63 * SECOND), 0.0)):
+        (found,) = with_probabilities((f,), AS_CONFIGURED, own, HERE)
+        assert found.probability == expected
+
+
+def test_a_robot_that_teammates_help_is_not_doubted_for_its_wheels() -> None:
+    """It sees no landmark, its wheels turn 0.8 of each turn, and fixes say where it is."""
+    odometry = OdometrySettings(distance_scale_sigma=0.1, turn_scale_sigma=0.2)
+    robot, rng = localizer(odometry=odometry), np.random.default_rng(1)
+    state = state_at(LOOP_START, diagonal(0.05, 0.05))
+    state, truth = robot.start(0)._replace(estimate=state.estimate), LOOP_START
+    for i, (distance, turn) in enumerate(6 * loop()):
+        now, truth = state.stamp_ns, step(truth, distance, 0.8 * turn)
+        state = robot.add_odometry(state, Odometry(now, now + SECOND // 10, distance, turn))
+        state = robot.predict(state, now + SECOND // 10)
+        if i % 20 == 0:
+            x, y = truth[:2] + 0.05 * rng.normal(size=2)
+            state = robot.add_fix(state, fix(x, y, state.stamp_ns))
+        stated, own = state.reported.position_sigma_m, state.estimate.position_sigma_m
+        assert stated < 1.5 * own
+    assert state.stamp_ns > 120 * SECOND
+    assert math.dist(state.estimate.pose[:2], truth[:2]) < 0.2
 
 
 def test_what_is_not_known_of_an_error_that_is_corrected_is_in_the_pose() -> None:
