@@ -63,14 +63,12 @@ def fix_for(
     """The fix of the robot that `observer` saw; None if range or bearing is missing or unusable.
 
     The sighting as a Gaussian (equations 1-2) is rotated into the field's frame and compounded with
-    the observer's pose covariance before it is sent: J C J^T, where J is the Jacobian of the
-    composition of field_from_observer with the sighting. An uncertain heading bends the line of
-    sight to an arc, which J does not contain, so the variance of this arc along the line of sight
-    is added to the observer's part. A heading of the teammate is the observer's heading plus the
-    one in the observer's frame, and so are their variances.
-
-    The covariances are computed at the mean place of `earlier` fixes, whose errors are independent
-    of this one. If they were computed at the readings themselves, repeated fixes would be biased
+    the observer's pose covariance before it is sent: J C J^T, J the Jacobian of the composition of
+    field_from_observer with the sighting. An uncertain heading bends the line of sight to an arc,
+    which J does not contain, so the arc's variance along the line of sight is added to the
+    observer's part. A heading of the teammate is the observer's plus the one in its frame, and so
+    are their variances. The covariances are computed at the mean place of `earlier` fixes, whose
+    errors are independent. Computed at the readings themselves, they would bias repeated fixes
     (Bordonaro, Willett, Bar-Shalom, Decorrelated unbiased converted measurement Kalman filter, IEEE
     Trans. AES, 2014). A first fix has only its own reading: see `unbiased_range_m`. The constant
     errors of the observer's camera (`common`) are part of the observer's error.
