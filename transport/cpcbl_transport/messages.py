@@ -229,8 +229,7 @@ def settings_from_model(model: SimulatedRobotModel) -> RobotSettings:
 
 
 class Join(msgspec.Struct, frozen=True, array_like=True, tag="join"):
-    """A guest asks the simulated field, again and again, to simulate it; `model` None: it
-    leaves."""
+    """A guest asks the simulated field, again and again, to simulate it. No `model`: it leaves."""
 
     robot: Name
     incarnation: str
