@@ -93,7 +93,7 @@ Recordings = Annotated[
 ]
 PoseFolder = Annotated[Path | None, Option(help="Or a folder of pictures that a robot took.")]
 Poses = Annotated[
-    Path | None, Option(help="Where (CSV): file, x_m, y_m, heading_deg, and robot for teammates.")
+    Path | None, Option(help="CSV of its poses: file, x_m, y_m, heading_deg; robot for teammates.")
 ]
 Observer = Annotated[
     str | None, Option(help="Robot whose camera it is; default: all with a camera.")
@@ -139,8 +139,8 @@ def camera(
     family: Annotated[str, Option(help="Of the markers (charuco).")] = "aruco_4x4_50",
     every: Annotated[float, Option(min=0.0, help="Seconds between two frames of a video.")] = 0.5,
     print_board: PrintBoard = None,
-    robot: Annotated[str | None, Option(help="Into this robot's table, or")] = None,
-    kind: Annotated[str | None, Option("--type", help="into this robot type's.")] = None,
+    robot: Annotated[str | None, Option(help="Write into this robot's table.")] = None,
+    kind: Annotated[str | None, Option("--type", help="Or into this robot type's table.")] = None,
     output: ToFile = None,
     picture: Residuals = None,
     as_json: AsJson = False,
