@@ -336,9 +336,8 @@ def _assess_quarantined(
 
 
 def united_majority(senders: SenderRecords, now_ns: int) -> tuple[str, ...]:
-    """The teammates that have contradicted the estimate since anybody last agreed with it, if they
-    are several, agree with each other, and are most of those that were heard recently; else
-    none."""
+    """The teammates that contradict the estimate since anybody last agreed with it, if they are
+    several, most of those that were heard lately, and agree with each other; else none."""
     heard = {
         n: r
         for n, r in senders.items()
@@ -356,16 +355,15 @@ def united_majority(senders: SenderRecords, now_ns: int) -> tuple[str, ...]:
 
 
 def _agree(one: ReportedPosition, other: ReportedPosition) -> bool:
-    """Whether two positions are as far from each other as the robot drove between them. (If the
-    robot is elsewhere than it believes, so is its heading, and offsets from its estimate
-    change.)"""
+    """Whether two positions are as far from each other as the robot drove between them. (Where it
+    is elsewhere than it believes, so is its heading, and offsets from its estimate change.)"""
     reported, driven, sigma = distances_between(one, other)
     return abs(reported - driven) <= JUMP_SIGMAS * sigma
 
 
 def reset_scores(senders: SenderRecords) -> SenderRecords:
-    """The records after the robot was lost. Its own error caused the scores of test 1, and the
-    estimate with which the reports were compared has been replaced."""
+    """The records after the robot was lost: its own error caused the scores of test 1, and another
+    estimate has replaced that with which the reports were compared."""
     reset = {n: r if r.reason else replace(r, score=0.0) for n, r in senders.items()}
     return {n: without_comparisons(r) for n, r in reset.items()}
 
