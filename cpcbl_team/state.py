@@ -276,7 +276,7 @@ def with_memory(state: State, memory: Memory) -> State:
 
 
 def with_beliefs(state: State, beliefs_of: State) -> State:
-    """The state with the beliefs of another one, and with the time of the latest report of both."""
+    """The state with the beliefs of another one, and when the latest report of both came."""
     _, senders, last_ns, landmarks = state.memory.teammates
     beliefs, _, other_ns, _ = beliefs_of.memory.teammates
     last_ns = other_ns if other_ns > last_ns else last_ns
