@@ -1,11 +1,12 @@
 """An uncertain heading puts the position on an arc, not on its tangent.
 
 A robot that drives with an uncertain heading is somewhere on an arc about the place where it set
-out; one that sees a single landmark, on an arc about that. The covariance of position and heading
-says where the arc's centre is. As the turn about that centre, and an offset that turns with it, the
-estimate is a Gaussian also where the heading's sigma is large: these are the coordinates of the
-group of rigid motions (Barrau & Bonnabel, The invariant extended Kalman filter as a stable
-observer, IEEE Transactions on Automatic Control 62, 2017). For no turn they are those of the pose.
+out. A robot that sees a single landmark is on an arc about that landmark. The covariance of
+position and heading says where the arc's centre is. So an estimate can be written as the turn about
+that centre, and an offset that turns with it. In these coordinates it is a Gaussian even where the
+heading's sigma is large: they are the coordinates of the group of rigid motions (Barrau & Bonnabel,
+The invariant extended Kalman filter as a stable observer, IEEE Transactions on Automatic Control
+62, 2017). Without a turn they are those of the pose.
 """
 
 import math
@@ -66,25 +67,24 @@ class Arc(NamedTuple):
         return a * x + b * y + c * turn, d * x + e * y + f * turn, turn
 
     def tangent_map(self, offset: Row) -> Matrix3:
-        """What makes an error of the estimate, on the tangent at its mean, one on the tangent
-        there."""
+        """The matrix that turns an error of the estimate on the tangent at its mean into an error
+        on the tangent there."""
         a, b, c, d, e, f, _, _, _ = self.jacobian(offset)
         to_x, to_y = -self.y, self.x  # the tangent at the mean
         return a, b, c - a * to_x - b * to_y, d, e, f - d * to_x - e * to_y, 0.0, 0.0, 1.0
 
 
 def arc_variance(heading_variance: float) -> float:
-    """The mean square by which a point at distance 1 comes nearer when its direction turns.
-
-    E[(1 - cos e)^2] of a Gaussian e, by E[cos n e] = exp(-n^2 variance / 2); about 3/4 of the
-    square of the variance while that is small.
-    """
+    """The mean square by which a point at distance 1 comes nearer when its direction turns by an
+    error e: E[(1 - cos e)^2] of a Gaussian e, by E[cos n e] = exp(-n^2 variance / 2). It is about
+    3/4 of the square of the variance while that is small."""
     return -2.0 * math.expm1(-0.5 * heading_variance) + 0.5 * math.expm1(-2.0 * heading_variance)
 
 
 def with_arc_width(estimate: Estimate) -> Estimate:
-    """The estimate with a covariance of the position that holds the arc, not only its tangent. It
-    is what others are told, and no prior: the next update would count its own bend again."""
+    """The estimate with a covariance of the position that contains the whole arc, not only its
+    tangent. Others are told this estimate. It is no prior of an update, because the next update
+    would count its own bend again."""
     _, _, _, xh, yh, hh = estimate.covariance
     if hh < STRAIGHT_RAD * STRAIGHT_RAD or xh == yh == 0.0:
         return estimate
@@ -96,8 +96,8 @@ def with_arc_width(estimate: Estimate) -> Estimate:
 
 
 def square_root(covariance: Covariance3) -> tuple[Row, Row, Row]:
-    """The columns of a square root of a covariance: of each the products, summed, are it (the
-    Cholesky decomposition)."""
+    """The columns of a square root of a covariance: the sum of their outer products is the
+    covariance (the Cholesky decomposition)."""
     xx, xy, yy, xh, yh, hh = covariance
     x = math.sqrt(max(xx, SMALLEST_VARIANCE))
     a, b = xy / x, xh / x

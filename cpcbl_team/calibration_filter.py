@@ -1,19 +1,19 @@
 """A second filter of a robot: its pose together with the errors of its own calibration.
 
 The filter of the robot takes its settings for right. A camera that is turned by 5°, or ranges that
-are a tenth too long, then make it wrong for ever and sure of it, for few landmarks at once fit
+are a tenth too long, then make it wrong for ever and sure of it, because few landmarks at once fit
 nearly any calibration. But no wrong calibration fits all the places to which a robot drives. So
 here five constant errors are states beside the pose: the bias of bearings, the share and the bias
 of ranges, and the scales of distances and turns (state augmentation; A. H. Jazwinski, Stochastic
 Processes and Filtering Theory, 1970, section 8.4). It uses the landmarks of the map alone, each
 once a second: nothing that a teammate says.
 
-A landmark that stands elsewhere than on the map is like an error of ranges to who passes it on one
-side. So each robot has `FILTERS` of these, and each of them leaves out other landmarks: what all of
-them find is no error of one place.
+To a robot that passes it on one side, a landmark that stands elsewhere than on the map looks like
+an error of ranges. So each robot has `FILTERS` of these filters, and each of them leaves out other
+landmarks: an error that all of them find is not that of one place.
 
-It begins with a pose that is hardly known, for the pose of the robot's own filter has the same
-errors in it.
+It begins with a pose that is hardly known, because the pose of the robot's own filter contains the
+same errors.
 """
 
 import math

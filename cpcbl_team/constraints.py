@@ -63,12 +63,13 @@ def curvature(prior: Covariance3, dx: float, dy: float) -> tuple[float, float]:
 
 
 def curved_variance(variance: float, predicted: float, curvature: float) -> float:
-    """The variance with which a measurement counts whose linear form is wrong within the prior.
+    """The variance with which a measurement counts if its linear form is not exact within the
+    prior.
 
-    `predicted` is the variance of the measurement that the prior predicts, H P H^T. What the linear
-    form leaves out is the same in each repetition while the robot stands, so that part of the
+    `predicted` is the variance of the measurement that the prior predicts, H P H^T. The error of
+    the linear form is the same in each repetition while the robot stands. So that part of the
     prior's variance stays (as that of a considered state; Schmidt 1966), and only the rest is
-    reduced. If there is no rest the measurement tells nothing.
+    reduced. Without a rest the measurement tells nothing.
     """
     if curvature <= 0.01 * predicted:
         return variance
@@ -110,7 +111,7 @@ def range_circle(
     pose: Pose2, x: float, y: float, range_m: float, sigma_m: float
 ) -> Constraint | None:
     """A range to the point (x, y). Its width is sigma_r along the normal; a circle says nothing
-    along its tangent (checklist row 35). None where the estimate is at the point."""
+    along its tangent (docs/paper.md, row 35). None where the estimate is at the point."""
     dx, dy = x - pose.x, y - pose.y
     distance = math.hypot(dx, dy)
     if distance < NEAREST_M:
@@ -137,8 +138,9 @@ def bearing_ray(pose: Pose2, x: float, y: float, bearing: float, sigma: float) -
 def bearing_position(
     pose: Pose2, x: float, y: float, bearing: float, sigma: float
 ) -> Constraint | None:
-    """The same, but linear at the estimate: the normal of a ray errs as its bearing does, and so
-    does the heading. It is the constraint on the heading, in metres across the line of sight."""
+    """A bearing to the point (x, y), linearized at the estimate. The normal of a ray errs with its
+    bearing, and so does the heading, so this is the constraint on the heading, in metres across the
+    line of sight."""
     c = bearing_heading(pose, x, y, bearing, sigma)
     if c is None or abs(c.residual) > FARTHEST_RAD:
         return None

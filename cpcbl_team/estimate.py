@@ -6,7 +6,7 @@ ITSC 2012): zero as long as nothing came from or went to a teammate.
 
 Which part a merge may move is its `Scope`. In the paper heading and position are updated apart; the
 covariance between the two is then only bookkeeping (a considered, not an estimated, state;
-Schmidt 1966) and gives the correlated sideways drift of resolution b.
+Schmidt 1966) and gives the correlated sideways drift (docs/paper.md, resolution b).
 """
 
 import math
@@ -100,7 +100,7 @@ def dot(a: Row, b: Row) -> float:
 
 
 def outer(a: Row) -> Covariance3:
-    """a a^T: the covariance of an error that is a times one of variance 1."""
+    """a a^T: the covariance of an error that is a times an error of variance 1."""
     x, y, h = a
     return Covariance3(x * x, x * y, y * y, x * h, y * h, h * h)
 
@@ -155,7 +155,7 @@ Sums = tuple[Six, Row]
 
 
 def sharpest(variance: float) -> float:
-    """The variance (m^2 or rad^2) with which a measurement counts: never sharper than rounding
+    """The variance (m^2 or rad^2) with which a measurement counts: at least what rounding
     allows."""
     return variance if variance > SHARPEST_VARIANCE else SHARPEST_VARIANCE
 
@@ -313,8 +313,8 @@ def merge(
     """Bayes' product of a prior and independent evidence (equations 3 and 4 in three dimensions).
 
     Works for evidence of any rank: one range says nothing along the tangent of its circle. Evidence
-    that is so much sharper than the prior that I + P A is lost in rounding changes nothing.
-    `as_circle`: the position's covariance is kept as a circle.
+    that is so much sharper than the prior that I + P A cannot be computed in floating point changes
+    nothing. `as_circle`: the position's covariance is kept as a circle.
     """
     pose, covariance, shared = prior
     x, y, heading = pose
@@ -346,11 +346,9 @@ def merge(
 
 
 def circle_variance(xx: float, xy: float, yy: float) -> float:
-    """The variance of the circle that stands for an ellipse: that of its major axis.
-
-    A smaller circle makes certainty of nothing: each reduction shortens the major axis, of which
-    one range says nothing however often it comes.
-    """
+    """The variance of the circle that stands for an ellipse: that of its major axis. A smaller
+    circle would create certainty from nothing: each reduction would shorten the major axis, of
+    which one range says nothing however often it comes."""
     variance = 0.5 * (xx + yy)
     if xy != 0.0 or xx != yy:
         half = 0.5 * (xx - yy)

@@ -31,19 +31,19 @@ _HEADING = ((0.0, 0.0, 1.0),)
 
 
 class MeanPlace(NamedTuple):
-    """Where a teammate was seen of late, in the field's frame (m)."""
+    """The mean place at which a teammate was seen recently, in the field's frame (m)."""
 
     stamp_ns: int
     x: float
     y: float
 
     def is_recent(self, stamp_ns: int) -> bool:
-        """Whether the teammate cannot have got far from there."""
+        """Whether the teammate cannot have gone far from there."""
         return stamp_ns - self.stamp_ns <= EARLIER_NS
 
 
 def mean_place(before: MeanPlace | None, fix: Fix) -> MeanPlace:
-    """The place with this fix, too: an exponential mean."""
+    """The place after this fix: an exponential mean."""
     if before is None or not before.is_recent(fix.stamp_ns):
         return MeanPlace(fix.stamp_ns, fix.x_m, fix.y_m)
     k = -math.expm1(-max(fix.stamp_ns - before.stamp_ns, 0) * 1e-9 / MEAN_S)
@@ -65,13 +65,13 @@ def fix_for(
     The sighting as a Gaussian (equations 1-2) is rotated into the field's frame and compounded with
     the observer's pose covariance before it is sent: J C J^T, J the Jacobian of the composition of
     field_from_observer with the sighting. An uncertain heading bends the line of sight to an arc,
-    which J does not know: its variance along the line of sight is added to the observer's part. A
-    heading of the teammate is the observer's plus the one in its frame, and so are their variances.
-    The covariances are those at the mean place of `earlier` fixes, whose errors are others. By the
-    axes and sigmas of the readings themselves, repeated fixes would be biased (Bordonaro, Willett,
-    Bar-Shalom, Decorrelated unbiased converted measurement Kalman filter, IEEE Trans. AES, 2014).
-    A first fix has but its own reading: see `unbiased_range_m`. The constant errors of the
-    observer's camera (`common`) are part of the observer's error.
+    which J does not contain, so the arc's variance along the line of sight is added to the
+    observer's part. A heading of the teammate is the observer's plus the one in its frame, and so
+    are their variances. The covariances are computed at the mean place of `earlier` fixes, whose
+    errors are independent. Computed at the readings themselves, they would bias repeated fixes
+    (Bordonaro, Willett, Bar-Shalom, Decorrelated unbiased converted measurement Kalman filter, IEEE
+    Trans. AES, 2014). A first fix has only its own reading: see `unbiased_range_m`. The constant
+    errors of the observer's camera (`common`) are part of the observer's error.
     """
     range_m, bearing = sighting.range_m, sighting.bearing_rad
     if range_m is None or bearing is None or sighting_fault(sighting):
@@ -104,8 +104,8 @@ def fix_for(
 
 
 def _observer_part(covariance: Covariance3, dx: float, dy: float) -> Covariance2:
-    """What the observer's pose adds to the covariance of a point that is so far from it (m, in the
-    field's frame)."""
+    """The covariance that the observer's pose adds to that of a point at this offset from it (m, in
+    the field's frame)."""
     jacobian = (1.0, 0.0, -dy, 0.0, 1.0, dx, 0.0, 0.0, 0.0)
     arc = arc_variance(covariance.hh)
     by_pose = covariance.transformed(jacobian).position()
@@ -119,8 +119,8 @@ def _sighted_gaussian(
     sensor: SensorSettings,
     earlier: tuple[float, float] | None,
 ) -> tuple[Gaussian2, float]:
-    """The teammate in the observer's frame, and the bearing (rad) at which its covariance is.
-    `earlier`: where it was seen of late, in that frame (m)."""
+    """The teammate in the observer's frame, and the bearing (rad) at which its covariance is
+    computed. `earlier`: where the teammate was seen recently, in that frame (m)."""
     x, y = earlier or (0.0, 0.0)
     expected_m = math.hypot(x, y) if earlier else None
     range_sigma, bearing_sigma = sighting_sigmas(sighting, sensor, expected_m)
@@ -143,14 +143,16 @@ def _sighted_gaussian(
 def unbiased_range_m(
     range_m: float, range_sigma_m: float, bearing_sigma: float, share_of_reading: float
 ) -> float:
-    """The range (m) at which a Gaussian stands for a sighting without pulling repeated fixes aside.
+    """The range (m) at which a Gaussian stands for a sighting so that repeated fixes are not
+    biased.
 
-    Three errors of second order depend on the reading, and so do not average out: a bearing that is
-    off puts the point too near, by r sigma_a^2 / 2; it also turns the axes of the Gaussian, which
-    adds sigma_r^2 / r in the end; and where sigma_r is a share of the reading, too short ones have
-    too much weight: 2 share^2 r. Together this is the mean of what the sighting says, as a density
-    over the plane. (Lerro & Bar-Shalom, Tracking with debiased consistent converted measurements,
-    IEEE Transactions on Aerospace and Electronic Systems, 1993, for the first of them.)
+    Three errors of second order depend on the reading, and so do not average out. A wrong bearing
+    puts the point too near, by r sigma_a^2 / 2. It also turns the axes of the Gaussian, which adds
+    sigma_r^2 / r in the end. And if sigma_r is a share of the reading, readings that are too short
+    have too much weight: 2 share^2 r. Together this is the mean of what the sighting says, as a
+    density over the plane. (Lerro & Bar-Shalom, Tracking with debiased consistent converted
+    measurements, IEEE Transactions on Aerospace and Electronic Systems, 1993, for the first of
+    them.)
     """
     ratio = min(range_sigma_m / range_m, 1.0 / MOST_SHIFT)  # whose square is beyond anyway
     share = ratio**2 + 2.0 * share_of_reading * share_of_reading
@@ -158,13 +160,13 @@ def unbiased_range_m(
 
 
 def arc_width(bearing_sigma: float) -> float:
-    """The sigma along the line of sight, in metres a metre of range, of a bearing that errs: that
-    of cos e, of a Gaussian e."""
+    """The sigma along the line of sight that an error of the bearing causes, in metres for each
+    metre of range: the sigma of cos e, for a Gaussian e."""
     return -math.sqrt(0.5) * math.expm1(-(bearing_sigma**2))
 
 
 def with_sensor_factor(fix: Fix, factor: float) -> Fix:
-    """The fix with the sensor's parts of its variances times this factor."""
+    """The fix with the sensor's parts of its variances multiplied by this factor."""
     if factor == 1.0:
         return fix
     xx, xy, yy = fix.sensor_covariance
@@ -218,19 +220,20 @@ class PoseObservation(NamedTuple):
         return self.source.removeprefix(FIX)
 
     def inflated(self, factor: float) -> "PoseObservation":
-        """With the sensor's part times this factor."""
+        """With the sensor's part multiplied by this factor."""
         heading = self.heading
         if heading is not None:
             heading = heading._replace(sensor_variance=factor * heading.sensor_variance)
         return self._replace(sensor=self.sensor.scaled(factor), heading=heading)
 
     def of_position(self, pose: Pose2) -> Observation:
-        """The observation of the position, about this estimate."""
+        """The observation of the position, as offsets from this estimate."""
         offset = self.x - pose.x, self.y - pose.y
         return Observation(_AXES, offset, self.sensor, self.observer or _NOTHING)
 
     def of_heading(self, pose: Pose2) -> Observation | None:
-        """The observation of the heading, if there is one, about this estimate."""
+        """The observation of the heading as an offset from this estimate; None without a
+        heading."""
         if self.heading is None:
             return None
         rad, sensor, observer = self.heading

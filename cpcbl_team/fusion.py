@@ -38,7 +38,7 @@ from cpcbl_team.geometry import new
 class Observation(NamedTuple):
     """One or two scalar measurements that have one teammate's pose error in common.
 
-    residuals = rows . offset + noise. The noise has a part of the sensor (independent) and a part
+    residuals = rows . offset + noise. The noise has two parts: the sensor's (independent), and that
     of the teammate's pose (dependent: the prior may contain it already).
     """
 
@@ -55,7 +55,8 @@ class Observation(NamedTuple):
         return new(Covariance2, _noise(xx + k * dxx, xy + k * dxy, yy + k * dyy))
 
     def shifted(self, dx: float, dy: float, turn: float) -> "Observation":
-        """About an estimate that is so far from the present one (m, rad in the field's frame)."""
+        """The same observation about an estimate at this distance from the present one (m, rad in
+        the field's frame)."""
         residuals = tuple(
             e - x * dx - y * dy - a * turn
             for (x, y, a), e in zip(self.rows, self.residuals, strict=True)
@@ -158,8 +159,8 @@ def merge_split(prior: Estimate, observation: Observation, scope: Scope = POSE) 
 
 
 def _tells_of_heading(covariance: Covariance3, observation: Observation) -> bool:
-    """Whether the observation tells the heading: itself, or as the robot drove since it knew its
-    position."""
+    """Whether the observation tells the heading: directly, or because the robot has driven since it
+    knew its position."""
     apart = covariance.position().determinant() * covariance.hh
     is_tied = covariance.determinant() < (1.0 - LEAST_TIED) * apart
     return is_tied or any(a for _, _, a in observation.rows)
@@ -184,7 +185,7 @@ def best_weight(objective: Callable[[float], float]) -> tuple[float, float]:
 
 
 def _size(covariance: Covariance3, scope: Scope) -> float:
-    """The quantity that a merge within this scope is to make small."""
+    """The quantity that a merge within this scope makes small."""
     if scope is POSE:
         return covariance.determinant()
     return covariance.hh if scope is HEADING else covariance.xx + covariance.yy
@@ -294,9 +295,6 @@ def mark_shared(estimate: Estimate) -> Estimate:
 
 
 def with_all_shared(estimate: Estimate) -> Estimate:
-    """The estimate with all of its covariance shared, if any of it is.
-
-    It is for the variants that update heading and position separately, because the split of a part
-    that is not updated is not defined.
-    """
+    """The estimate with all of its covariance shared, if any of it is. For the variants that update
+    heading and position separately: the split of a part that is not updated is not defined."""
     return estimate if estimate.shared is ZERO3 else mark_shared(estimate)

@@ -37,7 +37,7 @@ class Gate:
         self, state: State, measurements: Iterable[Measurement], scope: Scope
     ) -> tuple[State, GatedObjects]:
         """The constraints of each object, accepted or rejected by the chi-square bound of their
-        innovation, and the state about whose estimate they are linear. Where two poses agree with
+        innovation, and the state at whose estimate they are linearized. If two poses agree with
         what a robot with an uncertain heading measures, no object of the map is used."""
         measured = sorted(measurements, key=lambda m: m.source)
         found = self._relinearization.about_best_pose(state, measured)

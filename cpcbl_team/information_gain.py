@@ -5,9 +5,9 @@ Gains are in nats: the logarithm of the factor by which the 1 sigma ellipse of t
 factor by which the sigma of the heading shrinks. A sender does not know the receiver's covariance.
 It predicts it from the tier that the receiver announces and from the last fix that it sent.
 
-Gains say whether a message is worth its bytes now. To choose among messages that compete for one
-budget there is an effective age: what counts then is the error in metres, and how long it stays
-away, beside those of the other teammates.
+A gain says whether a message is worth its bytes now. Messages that compete for one budget are
+ordered by their effective age, which also takes into account how long the removed error (m) stays
+away, and how fast the variances of the other teammates grow.
 """
 
 import math
@@ -148,8 +148,8 @@ def information_gain(prior: Covariance2, after: Covariance2) -> float:
 
 
 def removed_variance(prior: Covariance2, after: Covariance2, heading_variance: float) -> float:
-    """The variance (m^2) that a fix removes, when it changes a teammate's covariance from `prior`
-    to `after`, and removes so much variance of its heading (rad^2)."""
+    """The variance (m^2) that a fix removes when it changes a teammate's covariance from `prior` to
+    `after`, and also removes this variance of its heading (rad^2)."""
     removed = prior.xx + prior.yy - after.xx - after.yy + HEADING_WAY_M**2 * heading_variance
     return max(0.0, removed)
 
@@ -170,15 +170,16 @@ def need_of(prior: Covariance2, last_fix: FixMemory | None, age_s: float, stamp_
 
 
 def effective_age_s(removed: float, age_s: float, needs: Collection[Need]) -> float:
-    """The age (s) of the last help at which a usual message would remove as much error over time
-    as one that removes this variance (m^2) now does.
+    """The age (s) of the last help at which a usual message would remove as much error over time as
+    one that removes this variance (m^2) now does.
 
-    If a variance grows by q in a second and a message costs c, a message each T seconds costs
-    q T / 2 + c / T, which is least where c = q T^2 / 2: a message is due when the variance that it
-    removes, times its age, has reached 2 c (the index of Whittle). The same price for all messages
-    is an interval T for a usual one, which removes the mean growth q of all `needs`, and others are
-    due when removed * age = q T^2. The root of removed * age / q is the effective age: that of a
-    usual message is its age. A fixed interval is the case that all messages are usual.
+    Let a variance grow by q in a second, and a message cost c. A message each T seconds then costs
+    q T / 2 + c / T, which is least where c = q T^2 / 2. So a message is due when the variance that
+    it removes, times its age, has reached 2 c (the index of Whittle). The price c is the same for
+    all messages. It is given by the interval T of a usual message, which removes the mean growth q
+    of all `needs`; any other message is due when removed * age = q T^2. The root of removed * age /
+    q is therefore called the effective age: that of a usual message is its age. With a fixed
+    interval all messages are usual.
     """
     grown, ages = sum(n.grown for n in needs), sum(n.age_s for n in needs)
     return math.sqrt(removed * age_s * ages / grown) if grown > 0.0 else age_s

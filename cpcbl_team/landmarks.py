@@ -1,9 +1,9 @@
 """Steps 2 to 4 of the cycle for plain landmarks: the fast path.
 
-Nearly everything that a robot sees is a point of the map, with the sensor model's own errors. These
-sightings need no record each: the formulas of `constraints.py` are applied to plain numbers, and
-their evidence is added up. All other sightings (of walls and teammates, with sigmas of their own,
-with faults) are left to `measurements.py`. `tests/core/test_landmarks.py` compares both ways.
+Nearly every sighting is of a point of the map, with the errors of the sensor model. Such a *plain*
+landmark needs no record of its own: the formulas of `constraints.py` are applied to plain numbers,
+and their evidence is added up. All other sightings (of walls and teammates, with sigmas of their
+own, with faults) are left to `measurements.py`. `tests/core/test_landmarks.py` compares both ways.
 """
 
 import math
@@ -62,8 +62,8 @@ class Mark:
 
 
 class Reading:
-    """What a landmark was seen with, as far as it is used: range (m), bearing (rad), and the
-    variance (m^2) of the range."""
+    """The used readings of one landmark: range (m), bearing (rad), and the variance (m^2) of the
+    range."""
 
     def __init__(
         self, name: str, mark: Mark, range_m: float | None, bearing: float | None, variance: float
@@ -105,8 +105,8 @@ class Landmarks:
         gates: tuple[float, float],
         has_common_errors: bool = False,
     ) -> None:
-        """`gates`: chi-square bounds of one and of two constraints. No landmark is plain where the
-        rules, or errors that all sightings have in common, ask for more than `update` does."""
+        """`gates`: chi-square bounds of one and of two constraints. No landmark is plain if the
+        rules, or errors that all sightings have in common, need more than `update` does."""
         rules, s = settings.localizer, settings.sensor
         plain = rules.variant != "weighted" and not (
             rules.paper_uncertainty or rules.learns or s.correlation_s > 0.0 or has_common_errors
@@ -133,9 +133,9 @@ class Landmarks:
         not_plain: frozenset[str],
         recorded: frozenset[str],
     ) -> LandmarkUpdate:
-        """What the landmarks among `sightings` say about position or heading, or about both. An
-        object that is `not_plain` is left to the general way; one of `recorded` is no new
-        evidence."""
+        """What the plain landmarks among `sightings` say about position or heading, or about both.
+        An object that is `not_plain` is left to `measurements.py`; one of `recorded` gives no new
+        evidence for recovery."""
         update, marks = LandmarkUpdate(state), self._marks
         if not_plain:
             marks = {name: mark for name, mark in marks.items() if name not in not_plain}
@@ -240,8 +240,8 @@ class Landmarks:
     def evidence_of(
         self, snapshot: LandmarkSnapshot, adaptation: Adaptation = AS_CONFIGURED
     ) -> list[Evidence]:
-        """The evidence of a snapshot, one piece a landmark, as the robot would measure it with this
-        adaptation of its settings."""
+        """The evidence of a snapshot, one piece for each landmark, as the robot would measure it
+        with its settings as they are adapted now."""
         stamp_ns, place, pose, sightings = snapshot
         _, _, bias, _, factor, ranges = adaptation
         scale, offset_m, k = ranges.scale, ranges.offset_m, sqrt(factor)
@@ -263,7 +263,7 @@ class Landmarks:
         return pieces
 
     def _readings(self, sightings: Sequence[Sighting], pose: Pose2) -> list[Reading]:
-        """What each landmark of a snapshot was seen with first, as far as it is used."""
+        """The used readings of each landmark of a snapshot, of its first sighting."""
         pose_x, pose_y, _ = pose
         readings: list[Reading] = []
         names: set[str] = set()
@@ -294,7 +294,8 @@ def _curved_weight(weight: float, prior: Covariance3, row: Row, curvature: float
 
 
 def _is_sound(range_m: float | None, bearing: float | None) -> bool:
-    """Whether there is a reading, and each that there is may be used (see `sighting_fault`)."""
+    """Whether there is a reading, and every reading that there is may be used (see
+    `sighting_fault`)."""
     return (
         (range_m is None or 0.0 < range_m <= LARGEST_M)
         and (bearing is None or -LARGEST_BEARING_RAD <= bearing <= LARGEST_BEARING_RAD)

@@ -80,9 +80,9 @@ class Localizer:
         team: frozenset[str] | None = None,
         camera: CameraSettings | None = None,
     ) -> None:
-        """`team`: its robots; who else sends something is a guest (None: there are no guests).
-        `camera`: of a robot whose sightings are its camera's, without the errors that all of them
-        have in common."""
+        """`team`: the robots of the team; every other sender is a guest (None: there are no
+        guests). `camera`: that of a robot whose sightings come from its camera; their sigmas do not
+        contain the errors that all of them have in common."""
         self.settings, self.field, rules = settings, field, settings.localizer
         gates = chi_square_bounds(rules.gate_probability)
         self._rules, self._gates = rules, gates
@@ -107,7 +107,8 @@ class Localizer:
     def cycle(self, state: State, frame: Sightings) -> State:
         """One cycle (paper, section 3, figure 1). Pure: the same inputs give the same bits.
 
-        `landmarks` holds the combined evidence of plain landmarks, `others` all other measurements.
+        `landmarks` holds the combined evidence of plain landmarks (`landmarks.py`), `others` all
+        other measurements. `scope` is the part of the pose that this frame updates.
         """
         now = frame.stamp_ns
         state = self.predict(state, now)  # 1. differential motion
@@ -150,7 +151,8 @@ class Localizer:
         """Step 2: which part of the pose the frame may update (None: no part), what its plain
         landmarks say about that part, and its other usable measurements.
 
-        The state then remembers the frame as evidence, and counts its faults.
+        The state that is returned remembers the frame as evidence for recovery, and counts its
+        faults.
         """
         now, stamp_ns, updates = frame.stamp_ns, state.stamp_ns, state.updates
         recovery = state.memory.recovery
@@ -180,8 +182,9 @@ class Localizer:
         return state, scope, landmarks, usable
 
     def _update_order(self, state: State) -> UpdateOrder:
-        """The parts of the pose that may be updated now, first the one that waits longer; each
-        type has its timer. The last is None: nothing."""
+        """The parts of the pose that may be updated now, in the order in which to try them: first
+        the one that has waited longer, at the end None (nothing). Heading and position have a timer
+        each."""
         updates = state.updates
         if state.has_no_heading:
             return (None,)
@@ -198,8 +201,8 @@ class Localizer:
     def _measure_others(
         self, state: State, sightings: Iterable[Sighting], now_ns: int
     ) -> tuple[State, list[Measurement], list[str]]:
-        """The state that estimates the places of what is seen, the usable ones of these sightings,
-        and the faults of those that have one."""
+        """Measures the sightings that are not plain landmarks: the state with what it now knows of
+        their places, the usable measurements, and the faults of the others."""
         mates, believed = state.memory.teammates, self.landmark_beliefs.usable(state)
         measured: list[Measurement] = []
         faults: list[str] = []
@@ -242,7 +245,8 @@ class Localizer:
         gated: GatedObjects,
         scope: Scope,
     ) -> State:
-        """The state with the estimate that a frame gave, and with the frame's bookkeeping."""
+        """The state with the estimate after a frame, and with the frame's counts, timers and
+        rejections."""
         used = landmarks.used
         accepted, others_rejected = gated
         if accepted:
@@ -260,8 +264,8 @@ class Localizer:
         used: dict[str, int],
         rejected: int,
     ) -> State:
-        """The new estimate, with timers, window and counts of an update by what is used (when:
-        now)."""
+        """The state after an update: the new estimate, the timers, the window of innovations and
+        the counts. `used`: the objects that were used, and when (now)."""
         now, updates, accepted = state.stamp_ns, state.updates, len(used)
         window = with_innovations(updates.innovations, accepted, rejected, self._window)
         updates = updates_with_frame(updates, now, scope, used, rejected, window)
@@ -273,12 +277,13 @@ class Localizer:
     # Teammates and the position sensor --------------------------------------------------------
 
     def add_fix(self, state: State, fix: Fix) -> State:
-        """Active collaboration: a teammate observes this robot's position, perhaps its heading. The
-        heading is merged as evidence of its own, after the position."""
+        """Active collaboration: a teammate saw this robot's position, perhaps its heading. The
+        heading is merged after the position, as a measurement of its own."""
         return self._observe_pose(state, fix.stamp_ns, from_fix(fix))
 
     def add_position(self, state: State, position: Position) -> State:
-        """The robot's own position sensor: like a fix, but no teammate's error is in it."""
+        """Merges a position of the robot's own sensor. It is like a fix that contains no teammate's
+        error."""
         before = self.predict(state, position.stamp_ns)
         observation, prior = from_position_sensor(position), before.estimate
         state = self._observe_pose(before, position.stamp_ns, observation)
@@ -339,7 +344,8 @@ class Localizer:
         return self.recovery.check(self._with_update(state, estimate, None, used, rejected))
 
     def _record_observation(self, state: State, observation: PoseObservation) -> State:
-        """With this as evidence of where the robot is, unless its sender is in quarantine."""
+        """The state that keeps this observation as evidence for recovery, unless its sender is in
+        quarantine."""
         memory = state.memory.teammates
         if not is_in_quarantine(state, observation.sender):
             evidence = evidence_from_observation(state, observation)
@@ -349,18 +355,19 @@ class Localizer:
         return state
 
     def add_teammate_belief(self, state: State, belief: Belief) -> State:
-        """Passive collaboration: keeps a teammate's belief, for when the teammate is visible. The
-        state's time stays, for to divide a motion would change the last bits of later poses."""
+        """Passive collaboration: keeps a teammate's belief until the teammate is seen. The time of
+        the state does not change, because dividing a motion would change the last bits of later
+        poses."""
         now_ns = belief.stamp_ns - BELIEF_VALID_BEFORE_NS
         return with_belief(state, belief, now_ns, now_ns - self._belief_age_ns)
 
     def mark_shared(self, state: State, event: BeliefShared) -> State:
-        """This robot's belief goes to a teammate: its information may come back."""
+        """This robot's belief goes to a teammate, so its information may come back."""
         state = self.predict(state, event.stamp_ns)
         return state._replace(estimate=mark_shared(state.estimate))
 
     def forget_wrong_inputs(self, state: State, event: InputsMended) -> State:
-        """What the robot changed in its settings because of wrong inputs is as configured again."""
+        """Resets what the robot changed in its settings because of wrong inputs."""
         state = self._calibration.without_adaptation(self.predict(state, event.stamp_ns))
         state = with_mended_inputs(state, event)
         return state if self._common is None else self._common.started(state)
@@ -368,7 +375,7 @@ class Localizer:
     # The start --------------------------------------------------------------------------------
 
     def set_pose(self, state: State, given: InitialPose) -> State:
-        """Somebody says where the robot is: nothing is left of what it believed."""
+        """Somebody says where the robot is. This replaces all that it believed."""
         state = self.predict(state, given.stamp_ns)
         was_wrong = not state.lost and not agrees(state.estimate, estimate_of(given))
         if self._common is not None and was_wrong:

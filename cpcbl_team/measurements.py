@@ -69,9 +69,10 @@ def nearest_belief(
 def position_by_belief(belief: Belief, at_ns: int) -> ObjectPosition:
     """The position of a belief's robot at another time.
 
-    A third of the extrapolated distance is added to its sigma, because it may have stopped or
-    turned; and of that at `DRIVES_ON_M` times its turn rate, because one that turned on the spot
-    may drive on. Its next belief may not come: with a wide heading it soon helps nobody.
+    A third of the extrapolated distance is added to its sigma, because the robot may have stopped
+    or turned. The same is added for a distance of `DRIVES_ON_M` times its turn rate, because a
+    robot that turned on the spot may drive on. Its next belief may not come: with a wide heading it
+    soon helps nobody.
     """
     pose, age = extrapolated(belief, at_ns), (at_ns - belief.stamp_ns) * 1e-9
     covariance = Covariance3(*belief.covariance)
@@ -106,7 +107,7 @@ class Measurement(msgspec.Struct, frozen=True, gc=False):
     @property
     def is_dependent(self) -> bool:
         """Whether its object's place has an error that the estimate may contain already, and that
-        is not kept beside it."""
+        is not estimated beside it."""
         is_uncertain = not self.is_estimated and any(self.position.covariance)
         return bool(self.sender) or is_uncertain
 
@@ -125,8 +126,8 @@ class Measurement(msgspec.Struct, frozen=True, gc=False):
         return msgspec.structs.replace(self, **sigmas)
 
     def corrected(self, bearing_bias: float, ranges: RangeErrors) -> "Measurement":
-        """Without this bias of its bearing (rad), and these errors of its range. (A bias of ranges
-        to teammates is another one.)"""
+        """Without this bias of its bearing (rad), and without these errors of its range. (Ranges to
+        teammates have another bias.)"""
         bearing = None if self.bearing is None else wrap_angle(self.bearing - bearing_bias)
         range_m = self.range_m
         if range_m is not None:
@@ -164,8 +165,8 @@ def measurement_of(
     common: CommonErrors | None = None,
     landmark_beliefs: Mapping[str, LandmarkBelief] = NO_BELIEFS,
 ) -> Measurement | None:
-    """The sighting, from about `pose`, with its object's position; None if that is not known.
-    `landmark_beliefs`: as of `map_object`."""
+    """The measurement of a sighting from about `pose`: its used readings with the position of its
+    object. None if that position is not known. `landmark_beliefs`: as in `map_object`."""
     name, is_for_heading, wall, gives = sighting.id, False, None, "both"
     on_map, sender = map_object(field, name, common, landmark_beliefs), name
     if on_map is not None:
@@ -214,7 +215,8 @@ def constrains(m: Measurement, scope: Scope | None, rules: config.LocalizerSetti
 def constraints_of(
     pose: Pose2, m: Measurement, scope: Scope, rules: config.LocalizerSettings
 ) -> list[Constraint]:
-    """Step 3: what one object says about position or heading; about both, each reading once."""
+    """Step 3: the constraints of one object on position or heading. If both are updated, each
+    reading gives one constraint."""
     x, y, _ = m.position
     range_m, bearing, wall = m.range_m, m.bearing, m.wall
     by_range = by_bearing = None
@@ -251,7 +253,8 @@ def left_out(prior: Estimate, m: Measurement, cs: list[Constraint]) -> list[floa
 
 
 def curved(prior: Estimate, m: Measurement, cs: list[Constraint]) -> list[Constraint]:
-    """The constraints on an object of the map, each as wide as its linear form is right."""
+    """The constraints on an object of the map, each with the variance that its linear form deserves
+    (see `curved_variance`)."""
     found = []
     for c, square in zip(cs, left_out(prior, m, cs), strict=True):
         px, py, ph = prior.covariance.times(c.row)
@@ -262,8 +265,9 @@ def curved(prior: Estimate, m: Measurement, cs: list[Constraint]) -> list[Constr
 
 
 def combine(evidence: Information, accepted: Iterable[GatedObject]) -> Information:
-    """Step 4: the Gaussians at the closest points of all constraints on the map's objects, as one
-    with `evidence`. Dependent ones (see `Measurement`) are merged on their own."""
+    """Step 4: `evidence` and the Gaussians at the closest points of all constraints on the map's
+    objects, as one sum. Dependent measurements (see `Measurement`) are not in it, because they are
+    merged one by one."""
     return evidence.with_all(
         (c.row, c.residual, c.sigma * c.sigma)
         for found in accepted
@@ -304,7 +308,7 @@ def gated_object(
 def sensitivities_of(
     m: Measurement, cs: list[Constraint], common: CommonErrors
 ) -> tuple[Sensitivity, ...]:
-    """How the residuals of constraints follow the common errors."""
+    """How much the residuals of constraints change with the common errors."""
     estimated = m.source if m.is_estimated else ""
     return tuple(
         common.sensitivity(estimated, c.place_row, c.is_bearing, c.row[2], m.range_m, m.bearing)
@@ -315,8 +319,8 @@ def sensitivities_of(
 def observation_of(prior: Estimate, m: Measurement, cs: list[Constraint]) -> Observation:
     """The constraints of one object as an observation of the prior, at which they are linearized.
 
-    The covariance of the object's place, as a teammate's (checklist row 39), is compounded with the
-    sensor's as the dependent part.
+    The covariance of the object's place is compounded with the sensor's as the dependent part, as
+    for a teammate's place (docs/paper.md, row 39).
     """
     rows, residuals = tuple(c.row for c in cs), tuple(c.residual for c in cs)
     sensor = [c.sigma * c.sigma for c in cs]

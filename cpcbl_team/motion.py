@@ -122,8 +122,8 @@ def part_of_piece(piece: Odometry, from_ns: int, until_ns: int) -> tuple[float, 
 
 
 def is_gap(pause_ns: int, before: Odometry, after: Odometry) -> bool:
-    """Whether odometry was lost in a pause; else stamps are inexact: it is short against both
-    pieces."""
+    """Whether odometry was lost in a pause. A pause below half of the shorter piece only means that
+    stamps are inexact."""
     shorter_ns = min(before.stamp_ns - before.from_ns, after.stamp_ns - after.from_ns)
     return 2 * pause_ns >= shorter_ns
 
@@ -173,8 +173,9 @@ def inflate_by_gap(
     estimate: Estimate, gap_ns: int, before: Odometry | None, gap_speed_m_s: float
 ) -> Estimate:
     """The estimate after a long time without odometry: a random walk. In one second it leads as far
-    as `gap_speed_m_s` and the last speed do, each for a second; a robot that drove may turn since
-    then, and one that turned may drive, so the larger of both speeds (m/s, rad/s) counts."""
+    as `gap_speed_m_s` and the last speed do, each for a second. A robot that drove may have turned
+    since then, and one that turned may have driven, so the larger of both speeds (m/s, rad/s)
+    counts."""
     fastest = 0.0 if before is None else max(map(abs, _speeds(before)))
     growth = (gap_speed_m_s**2 + fastest**2) * gap_ns * 1e-9
     added = Covariance3(growth, 0.0, growth, 0.0, 0.0, growth)
@@ -182,16 +183,14 @@ def inflate_by_gap(
 
 
 def drift_sigmas(moved: Pose2) -> tuple[float, float]:
-    """How far dead reckoning over such a motion errs, roughly (m, rad)."""
+    """Roughly how large the error of dead reckoning is over such a motion (m, rad)."""
     way, turn = math.hypot(moved.x, moved.y), abs(moved.heading)
     return DRIFT_SHARE * (way + 0.3 * turn), DRIFT_SHARE * (turn + 0.3 * way)
 
 
 def shortening(squared_m2: float, hh: float, added: float) -> float:
-    """The mean square (m^2) of what an unknown heading takes from a straight way of this squared
-    length, to second order.
-
-    A way of d ends short by (1/2) the integral of e^2, where the error e has the variance `hh` at
-    its begin, and has gained `added` at its end by a random walk (rad^2).
-    """
+    """The mean square (m^2) of how much shorter a straight way of this squared length becomes by an
+    unknown heading, to second order. A way of d ends short by (1/2) the integral of e^2. The error
+    e of the heading has the variance `hh` at its begin, and has gained `added` (rad^2) at its end
+    by a random walk."""
     return 0.25 * squared_m2 * (3.0 * hh * hh + (7.0 * hh * added + 1.75 * added * added) / 3.0)

@@ -61,11 +61,9 @@ class Prediction:
         return self._calibration.after_odometry(state)
 
     def predict(self, state: State, until_ns: int, following: Odometry | None = None) -> State:
-        """Step 1: the state at `until_ns`, moved along the known odometry (J C J^T, section 4).
-
-        Where odometry was lost the robot drives on as before; `following` is the piece that begins
-        at `until_ns`, if one does.
-        """
+        """Step 1: the state at `until_ns`, moved along the known odometry (J C J^T, section 4). If
+        odometry was lost, the robot is assumed to drive on as before; `following` is the piece that
+        begins at `until_ns`, if there is one."""
         stamp_ns, estimate = state.stamp_ns, state.estimate
         if until_ns <= stamp_ns:
             return state
@@ -114,8 +112,8 @@ class Prediction:
     def _after_arc(
         self, state: State, distance: float, turn: float, crawl_s: float, extra: MotionVariance
     ) -> tuple[State, Estimate]:
-        """The estimate after an arc, and the state that knows what wrong scales of the odometry did
-        to it."""
+        """The estimate after an arc, and the state with the effect that wrong scales of the
+        odometry have on it."""
         before, memory = state.estimate, state.memory.calibration
         estimate = self._variant.move(before, distance, turn, crawl_s, extra)
         scales = memory.scales

@@ -1,8 +1,8 @@
-"""Knowing that one is lost, and the evidence with which one is found again.
+"""When a robot is lost, and how it finds its pose again from evidence.
 
-A robot is lost when a sigma is over its limit, or when most of the last innovations were rejected.
-It then looks for its pose in recent evidence (`relocalization.py`); while that fails and it rejects
-what it measures, it inflates its covariance step by step until its gates open.
+A robot is lost when a sigma is over its limit, or when most of its last innovations were rejected.
+It then looks for its pose in recent evidence (`relocalization.py`). While that fails and it rejects
+what it measures, it inflates its covariance step by step until its gates accept measurements again.
 """
 
 from collections.abc import Callable, Sequence
@@ -65,7 +65,7 @@ UNCONFIRMED: Final = 3  # of them, for a robot to which nothing can tell that it
 
 
 class Recovery:
-    """Finds out that the robot is lost, and brings it back."""
+    """Detects that the robot is lost, and finds its pose again."""
 
     def __init__(
         self,
@@ -138,8 +138,8 @@ class Recovery:
         return self._found(state.counted("lost"), found, memory)
 
     def _unconfirmed(self, state: State, since_ns: int) -> str:
-        """Why nothing that a suspicious robot measures can confirm its pose: it is ranges to one
-        object, which agree with any pose at that distance. Empty if something can."""
+        """Why nothing that a suspicious robot measures can confirm its pose: it has only ranges to
+        one object, which agree with any pose at that distance. Empty if something can."""
         if rejected_of(state.updates.innovations)[0] < UNCONFIRMED:
             return ""
         evidence = self._evidence_since(state, since_ns)
@@ -149,8 +149,9 @@ class Recovery:
         return undetermined(evidence, state.updates.objects_ns, since_ns)
 
     def _outnumbered(self, state: State) -> str:
-        """Who shows a robot that sees only teammates that it is elsewhere: most of them, whose last
-        reports it rejected and which agree with each other. Empty if nobody does."""
+        """The teammates that show a robot that sees only teammates that it is elsewhere: most of
+        them contradict it, it rejected their last reports, and they agree with each other. Empty if
+        there are none."""
         if state.updates.innovations & (1 << UNCONFIRMED) - 1:
             return ""
         evidence = self._evidence_since(state, state.stamp_ns - WINDOW_NS)
@@ -229,8 +230,8 @@ class Recovery:
 
     def with_given_pose(self, state: State, given: InitialPose) -> State:
         """The state of a robot whose pose somebody sets. What it measured before may have been
-        measured elsewhere. If it believed to be elsewhere, teammates that disagreed with it may
-        have been right."""
+        measured elsewhere. If the robot believed that it was elsewhere, teammates that disagreed
+        with it may have been right."""
         estimate, senders = estimate_of(given), state.memory.teammates.senders
         if not agrees(state.estimate, estimate):
             senders = forget_reports(senders, state.stamp_ns)
@@ -239,7 +240,8 @@ class Recovery:
     def _begun_anew(
         self, state: State, estimate: Estimate, recovery: RecoveryMemory, senders: SenderRecords
     ) -> State:
-        """The state of a robot that begins anew with an estimate that its former one is not in."""
+        """The state of a robot that begins anew with an estimate that is independent of its former
+        one."""
         _, teammates, calibration, _ = memory = state.memory
         common, filters = calibration.common, calibration.filters
         memory = memory._replace(

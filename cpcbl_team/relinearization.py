@@ -1,8 +1,8 @@
-"""Where the measurements of a robot with an uncertain heading are linearized.
+"""At which pose the measurements of a robot with an uncertain heading are linearized.
 
-They are linearized at the pose that fits them best, along the arc of the prior (`arcs.py`), and the
-prior is expressed as a Gaussian on the tangent there. So all that follows is linear, as it is for a
-robot that knows its heading.
+That pose is the one on the arc of the prior (`arcs.py`) that fits the measurements best. The prior
+is expressed as a Gaussian on the tangent there. So all that follows is linear, as it is for a robot
+that knows its heading.
 """
 
 import math
@@ -40,7 +40,7 @@ class Linearization(NamedTuple):
         self, prior: Estimate, m: Measurement, rules: LocalizerSettings
     ) -> list[Constraint]:
         """The constraints on an object with residuals about the mean of `prior`, which is about the
-        tangent here; each as wide as its linear form is right."""
+        tangent here; each with the variance that its linear form deserves."""
         offset = self.arc.tangent_offset(self.fit.offset)
         constraints = constraints_of(self.pose, m, POSE, rules)
         if not constraints:
@@ -95,7 +95,7 @@ def _second_difference(before: Constraint, here: Constraint, after: Constraint) 
 
 
 class Relinearization:
-    """Finds where the measurements of one robot are linearized."""
+    """Finds the pose at which the measurements of one robot are linearized."""
 
     def __init__(
         self,
@@ -108,8 +108,8 @@ class Relinearization:
         self._rules, self._gates, self._common = settings.localizer, gates, common
 
     def is_due(self, state: State) -> bool:
-        """Whether the estimate is a Gaussian along an arc only. (That of a robot that rejects what
-        it measures is a doubt, and no arc.)"""
+        """Whether the estimate is a Gaussian along an arc only. (A robot that rejects what it
+        measures doubts its estimate, which is then no arc.)"""
         memory = state.memory.recovery
         is_doubt = memory.suspected_ns >= 0 or memory.kidnapped_ns >= 0
         is_bent = self._rules.estimates_whole_pose and state.estimate.covariance.hh > BENT_VARIANCE
@@ -119,8 +119,8 @@ class Relinearization:
         self, state: State, measurements: Iterable[Measurement]
     ) -> tuple[State, Linearization | None] | None:
         """The state with its prior about the pose that fits the objects of the map best, and that
-        pose; None if another pose fits nearly as well. The state as it is, and no pose, where its
-        estimate is no arc, or these objects leave none."""
+        pose; None if another pose fits nearly as well. If its estimate is no arc, or these objects
+        leave none, the state as it is, and no pose."""
         if not self.is_due(state):
             return state, None
         arc, objects = Arc.of(state.estimate), [m for m in measurements if not m.sender]
@@ -153,9 +153,9 @@ class Relinearization:
 
 
 def _leaves_arc(arc: Arc, m: Measurement) -> bool:
-    """Whether what an object says leaves a pose on an arc. Range and bearing to one point leave
-    nothing but a turn about it undetermined, whatever the prior is; other ones leave other curves
-    where more than the turn is uncertain."""
+    """Whether the poses that agree with an object are an arc. Range and bearing to one point leave
+    only a turn about that point undetermined, whatever the prior is. Other objects leave other
+    curves if more than the turn is uncertain."""
     if m.range_m is not None and m.bearing is not None and m.wall is None:
         return True
     xx, _, yy, _, _, hh = arc.covariance

@@ -1,17 +1,18 @@
 """The scales of the odometry, where the settings may be wrong about them.
 
-A robot whose tyres or floor differ from those of the day on which it was calibrated drives another
-share of each distance, and turns another share of each turn, than its odometry says. Such an error
-does not average out as noise does: it grows with the way. The covariance of the pose contains both
-shares (S. F. Schmidt 1966; A. H. Jazwinski, Stochastic Processes and Filtering Theory, 1970,
-section 8.4): it grows by what they do to the pose, and what an update takes of it, it takes of
-their part.
+If a robot's tyres or floor differ from those of the day on which it was calibrated, it drives
+another share of each distance, and turns another share of each turn, than its odometry says. Such
+an error does not average out as noise does: it grows with the way. So the covariance of the pose
+contains both shares (S. F. Schmidt 1966; A. H. Jazwinski, Stochastic Processes and Filtering
+Theory, 1970, section 8.4). It grows by what they do to the pose, and an update reduces their part
+with the rest.
 
-No reading depends on the scales but through the pose. So an update of the pose says all that it
-says of them: one that takes a pose of the covariance P to Q, and corrects it by d, corrects the
-scales by X^T P^-1 d, and leaves Q P^-1 X of their covariance X with the pose. The filter of the
-pose need not know of them. They are estimated beside it, as B. Friedland does with a bias (IEEE
-Transactions on Automatic Control, 1969), and corrected as far as an error is likely.
+A reading depends on the scales only through the pose. So an update of the pose contains all that a
+reading says about them. If it takes the covariance of the pose from P to Q, and corrects the pose
+by d, then it corrects the scales by X^T P^-1 d, and leaves Q P^-1 X of X, their covariance with the
+pose. The filter of the pose need not know about the scales: they are estimated beside it, as B.
+Friedland does with a bias (IEEE Transactions on Automatic Control, 1969). They are corrected only
+as far as an error is likely.
 """
 
 from math import cos, exp, sin, sqrt

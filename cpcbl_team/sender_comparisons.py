@@ -60,8 +60,8 @@ def supporters_of_estimate(
     claims: Collection[tuple[float, float]],
     began_ns: int,
 ) -> set[str]:
-    """The sources that agreed with the estimate since a dispute began, and not with the `claims` of
-    those that contradict it as well: offsets from the estimate, m."""
+    """The sources that agreed with the estimate since a dispute began, and do not agree as well
+    with the `claims` of the senders that contradict it (offsets from the estimate, m)."""
     return {
         name
         for name, r in recent.items()
@@ -73,8 +73,8 @@ def supporters_of_estimate(
 
 def _denies(record: SenderRecord, claims: Collection[tuple[float, float]]) -> bool:
     """Whether the mean of a source is nearer to the estimate than to these offsets from it, by more
-    than usual noise. A source that is too vague to tell agrees with both sides of a dispute. (One
-    without a mean is believed by its single reports.)"""
+    than usual noise. A source that is too vague to tell agrees with both sides of a dispute. (A
+    source without a mean is believed by its single reports.)"""
     mean = record.means[FAST]
     if mean is None:
         return True
@@ -83,7 +83,7 @@ def _denies(record: SenderRecord, claims: Collection[tuple[float, float]]) -> bo
 
 
 def members(senders: SenderRecords, names: Collection[str]) -> list[str]:
-    """Those of them that are no guests."""
+    """The robots of the team among these senders, without guests."""
     return [name for name in names if not senders[name].is_guest]
 
 
@@ -110,8 +110,9 @@ def doubted_guests(senders: SenderRecords, now_ns: int) -> list[str]:
 
 
 def is_left_out_guest(senders: SenderRecords, name: str, now_ns: int) -> bool:
-    """Whether a report of this guest is not used: it is in doubt, or it is new and contradicts the
-    estimate beside a robot of the team. That estimate needs no news of somebody unknown."""
+    """Whether a report of this guest is not used: because it is in doubt, or because it is new and
+    contradicts the estimate beside a robot of the team. Such an estimate needs no information from
+    an unknown sender."""
     record = senders[name]
     if not record.is_guest or record.confirmed >= LEAST_CONFIRMED:
         return False
@@ -140,8 +141,9 @@ def voters(senders: SenderRecords, now_ns: int) -> list[str]:
 
 
 def voting_means(senders: SenderRecords, now_ns: int, name: str, of: int) -> dict[str, MeanOffset]:
-    """The precise means (`of`: FAST or SLOW) of the recent sources but `name`, and of the silent
-    parties of contests with them; of guests as far as they have a vote, see `votes`."""
+    """The precise means (`of`: FAST or SLOW) of the recent sources except `name`, and of the silent
+    parties of contests with them. Guests are among them as far as they have a vote (see
+    `votes`)."""
     silenced = doubted_guests(senders, now_ns)
     means = {
         other: mean
@@ -212,14 +214,14 @@ def open_rivals(senders: SenderRecords, name: str) -> tuple[Rival, ...]:
 
 
 def rival_of(record: SenderRecord, name: str, other: SenderRecord) -> Rival:
-    """The other sender beside this one, by what both said last against the estimate."""
+    """The other sender as a rival of this one, with the distance between what both said last."""
     (x, y), (ox, oy) = (r.mean_offset if r.score else (0.0, 0.0) for r in (record, other))
     return Rival(name, ox - x, oy - y)
 
 
 def contest_m(senders: SenderRecords, name: str) -> float:
-    """How far from the estimate the robot may be, by this sender or by one with which it is in a
-    contest; 0 if it is in none."""
+    """How far from the estimate (m) the robot may be, according to this sender or to one with which
+    it is in a contest; 0 without a contest."""
     record, rivals = senders[name], open_rivals(senders, name)
     mean = record.means[FAST]
     if mean is None or mean.stamp_ns != record.last_report_ns:  # as if the estimate followed it
@@ -230,8 +232,8 @@ def contest_m(senders: SenderRecords, name: str) -> float:
 
 def compare(senders: SenderRecords, name: str, now_ns: int) -> Comparison | None:
     """The result of test 3; None while the sender has no recent mean that can be wrong. A majority
-    decides a contest by both means: in one, the estimate may move fast, and means of a long time
-    differ by that where one sender reported more of late than another."""
+    decides a contest only by both means. In a contest the estimate may move fast, and then means of
+    a long time differ if one sender reported more than another recently."""
     fast, slow = (_comparison_of(senders, name, now_ns, of) for of in (FAST, SLOW))
     found = fast or slow
     if fast is not None and slow is not None:
@@ -261,8 +263,8 @@ def _comparison_of(senders: SenderRecords, name: str, now_ns: int, of: int) -> C
 
 
 def _recent_count(senders: SenderRecords, voting: Collection[str], now_ns: int) -> int:
-    """How many senders were heard lately, with those in quarantine and without guests that have no
-    vote."""
+    """How many senders were heard recently: those in quarantine count, guests without a vote do
+    not."""
     return sum(
         now_ns - r.last_report_ns <= SILENCE_NS and (name in voting or not r.is_guest)
         for name, r in senders.items()
@@ -280,8 +282,8 @@ def _result(mean: MeanOffset, others: Mapping[str, MeanOffset], heard: int) -> C
 
 
 def wrong_turn(senders: SenderRecords, name: str, now_ns: int) -> MeanTurn | None:
-    """What the robot's own sensors, or all courses, say of the heading, where the headings of this
-    sender contradict it. None where they do not, or none came now."""
+    """The heading by the robot's own sensors, or by all courses, if the headings of this sender
+    contradict it. None if they do not, or if no heading came now."""
     headings = senders[name].headings
     mean = headings.mean() if headings.stamp_ns == now_ns else None
     if mean is None:
@@ -321,7 +323,7 @@ def with_comparison(
 
 
 def _contradicted(senders: SenderRecords, name: str, now_ns: int) -> tuple[Rival, ...]:
-    """The senders that the mean of this one contradicts, and of which nobody says that they are
+    """The senders that the mean of this one contradicts, without those that the others find
     wrong."""
     found = {}
     for of in (SLOW, FAST):

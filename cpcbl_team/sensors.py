@@ -29,7 +29,7 @@ def corrected_odometry(piece: Odometry, s: OdometrySettings) -> Odometry:
 
 
 def time_at_min_speed_s(distance_m: float, seconds: float, s: OdometrySettings) -> float:
-    """For how many of these seconds a robot that moved this far (true) drove at its least speed."""
+    """How many of these seconds a robot that moved this far (true) drove at its least speed."""
     slow = s.least_speed_m_s * seconds * (1.0 + SAME_SPEED)
     return seconds if 0.0 < abs(distance_m) <= slow else 0.0
 
@@ -90,8 +90,8 @@ def recalibrated(frame: Sightings, bias_rad: float, range_scale: float = 1.0) ->
 
 
 def sighting_fault(sighting: Sighting) -> SightingFault | None:
-    """Why a sighting must not be used (resolution i); None if it may be. A heading needs its own
-    sigma, because the sensor model has none."""
+    """Why a sighting must not be used (docs/paper.md, resolution i); None if it may be. A heading
+    needs its own sigma, because the sensor model has none."""
     r, a, h = sighting.range_m, sighting.bearing_rad, sighting.heading_rad
     range_sigma, bearing_sigma = sighting.range_sigma_m, sighting.bearing_sigma_rad
     heading_sigma = sighting.heading_sigma_rad

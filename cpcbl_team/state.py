@@ -31,7 +31,7 @@ MOST_OBJECTS = 4096  # of which the last use is kept
 
 
 class Evidence(NamedTuple):
-    """One measurement or report of the last seconds; a lost robot finds itself with it."""
+    """One measurement or report of the last seconds, by which a lost robot can find its pose."""
 
     stamp_ns: int
     odometry_from_robot: Pose2  # dead reckoning at that time
@@ -89,11 +89,9 @@ def updates_with_frame(
     gated: int,
     window: int,
 ) -> Updates:
-    """After an attempt to update `scope` (None: neither type), with the objects that were used (and
-    when: now), the number of those that were gated, and the new window.
-
-    An attempt passes the turn to the other type, an update starts the type's timer.
-    """
+    """The bookkeeping after an attempt to update `scope` (None: neither type): the objects that
+    were used (and when: now), the number of gated ones, and the new window. After an attempt it is
+    the turn of the other type; an update starts the type's timer."""
     position_ns, heading_ns, is_latest, objects_ns, accepted_ns, _, accepted, before = updates
     if used:
         if scope is POSITION or scope is POSE:
@@ -124,7 +122,7 @@ class Jump(NamedTuple):
 
 
 class RecoveryMemory(NamedTuple):
-    """Whether the robot is lost, and what it could find itself with."""
+    """Whether the robot is lost, and the evidence by which it could find its pose."""
 
     lost: str = ""  # the reason; empty while the robot is not lost
     inflated_ns: int = 0  # when a lost robot last inflated its covariance
@@ -155,7 +153,7 @@ class TeammateMemory(NamedTuple):
 
     @property
     def trusted_landmarks(self) -> Mapping[str, LandmarkBelief]:
-        """The places of landmarks as teammates say them who are not in quarantine."""
+        """The places of landmarks, as those teammates say that are not in quarantine."""
         if not self.landmarks:
             return self.landmarks
         in_quarantine = {name for name, record in self.senders.items() if record.reason}
@@ -165,7 +163,8 @@ class TeammateMemory(NamedTuple):
 
 
 class Memory(NamedTuple):
-    """What few cycles change: one record for each part of the localizer that remembers."""
+    """What changes in few cycles only: one record for each part of the localizer that remembers
+    something."""
 
     recovery: RecoveryMemory = RecoveryMemory()
     teammates: TeammateMemory = TeammateMemory()
@@ -173,7 +172,7 @@ class Memory(NamedTuple):
     events: Mapping[str, int] = _NONE  # number of each thing but updates that is counted
 
     def counted(self, *events: str) -> "Memory":
-        """The memory in which these have happened once more."""
+        """The memory in which each of these events has happened once more."""
         return self._replace(events=Counter(self.events) + Counter(events)) if events else self
 
 
@@ -190,7 +189,8 @@ class State(NamedTuple):
 
     @property
     def reported(self) -> Estimate:
-        """The estimate as it is belief to others: as uncertain as the settings are, too."""
+        """The estimate that others are told. Its covariance contains what may be wrong with the
+        settings, too."""
         known = self.memory.calibration
         estimate = with_doubts(with_arc_width(self.estimate), known.check)
         estimate = with_scales_doubted(estimate, known.scales)
@@ -214,12 +214,12 @@ class State(NamedTuple):
 
     @property
     def counts(self) -> Mapping[str, int]:
-        """How often each thing has happened that has happened at all."""
+        """How often each event has happened, of those that have happened at all."""
         counts = {"accepted": self.updates.accepted, "gated": self.updates.gated}
         return {name: n for name, n in {**counts, **self.memory.events}.items() if n}
 
     def counted(self, *events: str) -> "State":
-        """The state in which these have happened once more."""
+        """The state in which each of these events has happened once more."""
         return with_memory(self, self.memory.counted(*events)) if events else self
 
 
@@ -258,8 +258,9 @@ def with_motion(state: State, stamp_ns: int, estimate: Estimate, place: Pose2) -
 
 
 def with_unknown_heading(state: State) -> State:
-    """The state of a lost robot that knows nothing of its heading: nothing of its position tells
-    it, for no motion with an unknown heading can be linearized. Any other state as it is."""
+    """The state of a lost robot that knows nothing of its heading: position and heading are
+    uncorrelated in it, because no motion with an unknown heading can be linearized. Any other state
+    as it is."""
     if not state.has_no_heading:
         return state
     pose, covariance, shared = state.estimate
@@ -283,7 +284,8 @@ def with_beliefs(state: State, beliefs_of: State) -> State:
 
 
 def with_belief(state: State, belief: Belief, now_ns: int, oldest_ns: int) -> State:
-    """The state with a teammate's belief that came now, without those that are older than this."""
+    """The state with a teammate's belief that came now, and without beliefs older than
+    `oldest_ns`."""
     beliefs = {
         name: fresh
         for name, all_of_it in state.memory.teammates.beliefs.items()

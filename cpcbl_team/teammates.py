@@ -1,8 +1,8 @@
-"""Screening what teammates report by the trust that they have (beyond the paper).
+"""Screening of what teammates report, by how far the robot trusts them (beyond the paper).
 
-Every report about this robot's position, and every sighting of a teammate as a landmark, is
-assessed by `trust.py`. What may not be used is left out; where the estimate has followed it
-before, the covariance is inflated.
+`trust.py` assesses every report about this robot's position, and every sighting of a teammate as a
+landmark. A report that may not be used is left out. If the estimate has followed it before, the
+covariance is inflated.
 """
 
 from collections.abc import Collection, Iterable
@@ -74,11 +74,12 @@ class TeammateScreen:
         self.is_active = self._rules.enabled and is_probabilistic
 
     def has_recent_reports(self, state: State, now_ns: int) -> bool:
-        """Whether a teammate has reported anything lately that is to be screened."""
+        """Whether a teammate has recently reported anything that must be screened."""
         return self.is_active and now_ns - state.memory.teammates.last_report_ns <= RECENT_NS
 
     def is_due(self, state: State, gated: GatedObjects) -> bool:
-        """Whether what teammates say is to be screened in a frame: of late, or of its landmarks."""
+        """Whether teammates' information must be screened in this frame: because one of them
+        reported recently, or because a landmark of the frame stands where a teammate says."""
         if self.has_recent_reports(state, state.stamp_ns):
             return True
         return self.is_active and any(f.measurement.sender for objects in gated for f in objects)
@@ -103,9 +104,10 @@ class TeammateScreen:
         return state, gated._replace(accepted=accepted_)
 
     def _screen_reports(self, state: State, gated: GatedObjects) -> tuple[State, set[str]]:
-        """The state after what teammates say of the objects of a frame, and those that are not
-        trusted. A teammate that is seen is a report of its own. All landmarks that stand where it
-        says are one report, for they have the error of this robot's own pose in common."""
+        """The state after the objects of a frame that teammates report, and the senders that are
+        not trusted. Each teammate that is seen is one report. All landmarks that stand where one
+        teammate says are one report together, because they have the error of this robot's own pose
+        in common."""
         reports: dict[tuple[str, bool], list[GatedObject]] = {}
         for found in (*gated.accepted, *gated.rejected):
             m = found.measurement
@@ -132,8 +134,8 @@ class TeammateScreen:
         return state, distrusted
 
     def _with_caution(self, state: State, found: GatedObject) -> GatedObject:
-        """A teammate, or a landmark that stands where a teammate says, with what this robot adds to
-        the covariance of its position."""
+        """A teammate, or a landmark that stands where a teammate says, with the increased
+        covariance that `cautious` gives its position."""
         m = found.measurement
         if not m.sender:
             return found
@@ -157,17 +159,17 @@ class TeammateScreen:
         return self._assess(state, belief.robot, report, belief.landmark)
 
     def with_caution(self, state: State, observation: PoseObservation) -> PoseObservation:
-        """A teammate's fix with what this robot adds to the observer's part of its covariance."""
+        """A teammate's fix, with the observer's part of its covariance increased by `cautious`."""
         if observation.observer is None:
             return observation
         observer = self.cautious(state, observation.sender, observation.observer)
         return observation._replace(observer=observer)
 
     def cautious(self, state: State, sender: str, dependent: Covariance2) -> Covariance2:
-        """The part of a teammate's noise that is the same in all its reports: never below what this
-        robot believes any teammate, and with the bias that others find in it. Split covariance
-        intersection does not average this part away, so it bounds the weight of all its reports
-        together."""
+        """The part of a teammate's covariance that is the same in all its reports, increased to the
+        least that this robot assumes of any teammate, and by the bias that others find in the
+        teammate. Split covariance intersection does not average this part away, so it bounds the
+        weight of all its reports together."""
         record = state.memory.teammates.senders.get(sender)
         rules = self._rules
         is_new = record is None or record.confirmed < LEAST_CONFIRMED
@@ -181,8 +183,8 @@ class TeammateScreen:
         return dependent + Covariance2(more, 0.0, more) if more else dependent
 
     def has_no_vote(self, state: State, sender: str) -> bool:
-        """Whether this is a guest whose rejected reports do not tell that the robot is lost: beside
-        robots of the team, several guests could make it lost whenever they like."""
+        """Whether this is a guest whose rejected reports do not count towards being lost. Otherwise
+        several guests beside robots of the team could make it lost whenever they like."""
         if not self.is_active or not self._is_guest(sender):
             return False
         return sender not in voters(state.memory.teammates.senders, state.stamp_ns)
@@ -191,7 +193,7 @@ class TeammateScreen:
         return self._teammates is not None and sender not in self._teammates
 
     def _evidence(self, state: State, observation: Observation) -> OffsetEvidence:
-        """What a sighting of a teammate says of the offset of the estimate."""
+        """What a sighting of a teammate says about the offset of the estimate."""
         dependent = observation.dependent
         sums = observation.information(observation.noise(0.0))
         variance = 0.5 * (dependent.xx + dependent.yy)
@@ -256,7 +258,7 @@ class TeammateScreen:
     def _with_own_sensors(
         self, state: State, accepted: int, rejected: int, evidence: OffsetEvidence
     ) -> State:
-        """The state with how far the robot's own sensors agree with the estimate."""
+        """The state with the record of how well the robot's own sensors agree with the estimate."""
         memory = state.memory.teammates
         result = state.stamp_ns, accepted, rejected, self._rules.limit, evidence
         senders = trust.with_own_sensor_result(memory.senders, *result)
@@ -288,9 +290,9 @@ class TeammateScreen:
 
 
 def _evidence_at(state: State, sums: Sums, dependent: Covariance2 = NOTHING) -> OffsetEvidence:
-    """Sums about the offset of the state's estimate, with the error of its position in them. Of an
-    error that lasts, as in a contest, only a part changes between reports: the rest is what means
-    shall find."""
+    """Sums about the offset of the state's estimate, in which the error of its position counts as
+    noise. Where an error lasts, as in a contest, only a part of it changes between reports; the
+    means are to find the rest, so only that part counts."""
     c = state.estimate.covariance
     share = min(1.0, CHANGING_M2 / max(c.xx + c.yy, CHANGING_M2))
     sums = with_position_error(sums, Covariance2(share * c.xx, share * c.xy, share * c.yy))
@@ -298,7 +300,7 @@ def _evidence_at(state: State, sums: Sums, dependent: Covariance2 = NOTHING) -> 
 
 
 def _own_offset(state: State, sums: Information, accepted: Iterable[GatedObject]) -> OffsetEvidence:
-    """What the robot's own sensors say of the offset of the estimate in one frame."""
+    """What the robot's own sensors say about the offset of the estimate in one frame."""
     common, variance = state.common_errors, state.estimate.covariance.hh
     if common is None:
         return _evidence_at(state, with_heading_error(sums, variance))
@@ -323,8 +325,8 @@ def _own_offset(state: State, sums: Information, accepted: Iterable[GatedObject]
 
 
 def _with_camera(state: State, m: Measurement, evidence: OffsetEvidence) -> OffsetEvidence:
-    """What a sighting of a teammate says of the offset, with the errors of the heading and the
-    constant errors of the camera in it."""
+    """What a sighting of a teammate says about the offset, with the errors of the heading and the
+    constant errors of the camera as noise."""
     common = state.common_errors
     if common is None:
         sums = with_heading_error(evidence.evidence, evidence.heading_variance)
@@ -338,14 +340,15 @@ def _with_camera(state: State, m: Measurement, evidence: OffsetEvidence) -> Offs
 
 
 def _without_heading(sums: Sums, heading_variance: float) -> Information:
-    """What a frame says of the position alone: the error of the heading is not the same in all."""
+    """What a frame says about the position alone, because the error of the heading differs from
+    frame to frame."""
     (xx, xy, yy), (x, y) = about_position(sums, heading_variance)
     return Information(Covariance3(xx, xy, yy, 0.0, 0.0, 0.0), (x, y, 0.0))
 
 
 def _bounded(senders: SenderRecords) -> SenderRecords:
-    """The records without the older half of them, by their last reports, when there are too many:
-    guests of ever new names may come."""
+    """The records without the older half of them, by their last reports, if there are too many:
+    guests may come under ever new names."""
     if len(senders) <= MOST_SENDERS:
         return senders
     names = sorted(senders, key=lambda name: senders[name].last_report_ns)

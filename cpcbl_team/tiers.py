@@ -24,8 +24,8 @@ def tier_of(sigma_m: float, width: float) -> int:
 def next_tier(
     present: int | None, sigma_m: float, lost: bool, settings: CollaborationSettings
 ) -> int:
-    """The tier to announce: the present one while sigma stays near it, the lowest if the robot is
-    lost, and never one better than `best_tier`."""
+    """The tier to announce: the present one while sigma stays near its limits, the lowest (15) if
+    the robot is lost, and never one better than `best_tier`."""
     if lost:
         return LOWEST_TIER
     if present is None or present == LOWEST_TIER:
@@ -36,5 +36,6 @@ def next_tier(
 
 
 def accepted_tiers(own: int, settings: CollaborationSettings) -> range:
-    """The tiers from which a robot accepts help: all better than its own, or all there are."""
+    """The tiers from which a robot accepts help: all better than its own, or every tier with both
+    directions."""
     return range(LOWEST_TIER + 1 if settings.direction == "both-ways" else own)

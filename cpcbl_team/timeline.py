@@ -97,8 +97,9 @@ class Timeline:
         return self._state_before(len(self._inputs))
 
     def add(self, item: Input) -> TimelineRefusal | None:
-        """Inserts an input at its time; the reason if it cannot be used. The states after it are
-        computed when they are asked for: often several inputs arrive late."""
+        """Inserts an input at its time, and returns the reason if it cannot be used. The states
+        after it are computed only when they are asked for, because often several inputs arrive late
+        together."""
         key, keys, states = _key(item), self._keys, self._states
         is_beyond_horizon = bool(keys) and key[0] < keys[-1][0] - self._horizon_ns
         if is_beyond_horizon or _measured_ns(item) < self._start_ns:
@@ -117,8 +118,9 @@ class Timeline:
         return None
 
     def _keep_states(self, index: int, belief: Belief, known: list[State]) -> None:
-        """Keeps what was known after a belief. It is always late, but does not change the states
-        before the first frame to which it is its robot's nearest belief."""
+        """Keeps the states after a belief up to the first input whose result the belief changes.
+        Every belief arrives late, but until the first frame to which it is the nearest belief of
+        its robot, each known state only gets the belief and need not be computed again."""
         screen, states = self._localizer.screen, self._states
         state = self._state_before(index + 1)
         for item, (before, after) in zip(self._inputs[index + 1 :], pairwise(known), strict=False):
@@ -129,9 +131,9 @@ class Timeline:
             states.append(state)
 
     def branched(self, begun: Callable[[State], State]) -> "Timeline":
-        """Another timeline of the same localizer, for another frame: it begins with what `begun`
-        makes of the oldest state that is kept, and has all inputs since then that hold in any
-        frame, which are those of the robot's own sensors."""
+        """A second timeline of the same localizer, for another frame. It begins with `begun` of the
+        oldest state that is kept, and gets all inputs since then that hold in every frame: those of
+        the robot's own sensors."""
         branch = self.begun_anew(begun(self._states[0]))
         for item in self._inputs:
             if isinstance(item, OWN_SENSORS):
@@ -139,7 +141,7 @@ class Timeline:
         return branch
 
     def begun_anew(self, state: State) -> "Timeline":
-        """A timeline of the same localizer, which begins with this state."""
+        """A new timeline of the same localizer, which begins with this state."""
         return Timeline(self._localizer, state, self._horizon_ns)
 
     def latest(self, now_ns: int) -> State:

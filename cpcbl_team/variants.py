@@ -111,11 +111,9 @@ class JointVariant:
 
 
 class OvalVariant(JointVariant):
-    """Position and heading apart, the position's covariance of any shape.
-
-    Where the map gives only ranges nothing else would correct the heading, and a linear filter
-    would not know where the robot drives. There they do so through the covariance with it.
-    """
+    """Position and heading apart; the position's covariance has any shape. If the map gives only
+    ranges, nothing else would correct the heading, and a linear filter would not know where the
+    robot drives. Then ranges correct it through its covariance with the position."""
 
     def __init__(self, settings: LocalizationSettings, field: Field) -> None:
         super().__init__(settings)
@@ -174,8 +172,8 @@ class CircularVariant(OvalVariant):
         self, prior: Estimate, observation: Observation, scope: Scope, by_teammate: bool = True
     ) -> Estimate:
         """Covariance intersection makes one axis shorter and the other one longer, and a circle is
-        as wide as the longer one. An object that is seen again and again would widen it for ever:
-        then it tells nothing."""
+        as wide as the longer axis. So an object that is seen again and again would widen the circle
+        for ever; such an observation changes nothing."""
         after = super().observe(prior, observation, scope, by_teammate)
         before, now = prior.covariance.position(), after.covariance.position()
         is_wider = circle_variance(*now) > circle_variance(*before)
@@ -188,9 +186,9 @@ class CircularVariant(OvalVariant):
 
 
 class WeightedVariant(CircularVariant):
-    """Weighted averages. The covariance is nominal, for the variant has no estimate of its quality,
-    but gates and tiers need a number. It is what the last disagreement with a sensor left over, and
-    a configured value at least."""
+    """Weighted averages. Gates and tiers need a covariance, but the variant has no estimate of its
+    quality. So its covariance is nominal: what the last disagreement with a sensor left over, and a
+    configured value at least."""
 
     is_probabilistic = False
 

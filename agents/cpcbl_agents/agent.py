@@ -29,7 +29,7 @@ class PoseEstimate(NamedTuple):
 
 
 class FrameEstimate(NamedTuple):
-    """The filter's estimate at the time of a frame, from which fixes are made. The frame's bearings
+    """The filter's estimate at the time of a frame; fixes are made of both. The frame's bearings
     are corrected by the bias that the robot knows, as the estimate is."""
 
     frame: Sightings
@@ -40,8 +40,9 @@ class FrameEstimate(NamedTuple):
 
 
 class LandmarkPlaces(NamedTuple):
-    """Where landmarks are that are not on the team's map: as the robot itself has found them, or
-    knew them before, and as teammates have said; in the robot's frame, or in a better one."""
+    """The places of landmarks that are not on the team's map: as the robot itself found them or
+    knew them before, and as teammates have said. They are in the robot's frame, or in a better
+    one."""
 
     places: tuple[LandmarkBelief, ...]
     frame: str = FIELD
@@ -82,7 +83,7 @@ class BeliefSubscribers(NamedTuple):
 
 
 class LandmarkSubscribers(NamedTuple):
-    """Of which landmarks any teammate wants to know the place, as this robot knows it."""
+    """The landmarks whose places, as this robot knows them, a teammate wants to know."""
 
     landmarks: frozenset[str]
 

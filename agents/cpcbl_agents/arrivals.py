@@ -24,7 +24,7 @@ class Arrivals:
         self._frames: deque[tuple[str, bytes]] = deque(maxlen=1)
         self._tokens: deque[tuple[str, bool]] = deque(maxlen=INBOX)
         self._namesakes: set[str] = set()  # tokens of other processes with this robot's name
-        # What threads of the bus count has its entry: to add one, another thread must not read
+        # Entries exist from the start: to add one while another thread reads them would fail
         self._counts: Counter[str] = Counter(dict.fromkeys(COUNTED, 0))
 
     # On a thread of the bus ---------------------------------------------------------------------
@@ -93,10 +93,10 @@ class Arrivals:
         return self._frames.popleft() if self._frames else None
 
     def note_taken(self, taken: int, waiting: int) -> None:
-        """So many messages were taken of those that waited. If some are left, the next one is of
-        the quietest sender, not the oldest."""
+        """Notes that so many messages were taken of those that waited. If some are left, the next
+        one is from the quietest sender, not the oldest."""
         self._inbox.is_fair = taken < waiting
 
     def pop_overflow(self) -> tuple[int, Counter[str]]:
-        """How many messages wait, and those that were dropped since the last call, by sender."""
+        """How many messages wait, and how many were dropped since the last call, by sender."""
         return len(self._inbox), self._inbox.pop_dropped()

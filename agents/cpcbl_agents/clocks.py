@@ -65,8 +65,8 @@ class ClockMonitor:
         return max(-LARGEST_NUMBER, min(late_s, LARGEST_NUMBER))
 
     def off(self, now_ns: int) -> frozenset[str]:
-        """The teammates whose clocks are off, by what came of them lately: of one that has been
-        silent for longer, nothing is known."""
+        """The teammates whose clocks are off, by their recent messages. Of a teammate that has been
+        silent for longer nothing is known."""
         return frozenset(
             name
             for name, spans in self._spans.items()

@@ -40,8 +40,8 @@ def _size(message: Help) -> int:
 
 
 class _Offer(NamedTuple):
-    """A fix that could be sent, its information gain (nats), its effective age, and what its robot
-    knows after it."""
+    """A fix that could be sent: its information gain (nats), its effective age, whether its robot
+    is lost, and what that robot knows after it."""
 
     gain: float
     age_s: float
@@ -242,9 +242,9 @@ class CollaborationAgent:
         return self._affordable(offers, now_ns)
 
     def _sent_early(self, now_ns: int) -> list[Fix]:
-        """The fixes of robots that were seen shortly before their tier became known, or before they
-        were subscribed. Tiers are watched only of teammates that are seen, so at a rare meeting
-        there may be no other fix."""
+        """The fixes of robots that were seen before their tier was known, or before they
+        subscribed. Tiers are watched only of teammates that are seen, so at a short meeting there
+        may be no other fix."""
         ready = [fix for name, fix in self._early_fixes.items() if name in self.frames.tiers]
         for fix in ready:
             del self._early_fixes[fix.robot]
@@ -254,7 +254,7 @@ class CollaborationAgent:
         )
 
     def _worth_sending(self, fix: Fix) -> list[_Offer]:
-        """The fix, if it may be sent now and is worth it."""
+        """The fix as an offer, if it may be sent now and its gain is large enough."""
         tier = self.frames.tiers[fix.robot]
         if not self._may_help(fix, tier):
             return []
@@ -369,7 +369,7 @@ class CollaborationAgent:
 
     def _teammates_to_help(self, now_ns: int) -> int:
         """How many teammates share the budget. Beginning with the one that was seen last, each
-        counts that was seen within the interval that the budget pays for those before it."""
+        counts if it was seen within the interval that the budget pays for those before it."""
         number, stamps = 0, sorted((n.stamp_ns for n in self._needs.values()), reverse=True)
         while number < len(stamps) and (
             now_ns - stamps[number]

@@ -22,7 +22,8 @@ _BY_TIER = tuple(topic.key.split("/")[0] + "/" for topic in (topics.BELIEF, topi
 
 
 class Declarations:
-    """One robot's declarations; `update` fits them to what the robot is interested in."""
+    """One robot's declarations on the bus; `update` changes them to what the robot is interested
+    in."""
 
     def __init__(
         self,
@@ -113,8 +114,8 @@ class Declarations:
             self._publishers.pop(key).close()
 
     def update_landmarks(self, tiers: Mapping[str, int]) -> frozenset[str]:
-        """The landmarks whose places somebody asks for in these tiers. Publishers of others are
-        taken back."""
+        """The landmarks whose places somebody asks for in these tiers. The publishers of all others
+        are taken back."""
         if not (tiers or self._keys_of_landmarks):
             return frozenset()
         keys = {self._landmark_key(name, tier): name for name, tier in sorted(tiers.items())}

@@ -92,8 +92,8 @@ class FilterAgent:
 
     @property
     def all_counts(self) -> Counter[str]:
-        """What this agent refused, what the localizer used and gated, and what it finds wrong in
-        the settings and the map."""
+        """What this agent refused, what the localizer used and gated, and what is wrong with the
+        settings and the map as the robot finds them."""
         state = self.timeline.state
         factors = percentages(state.memory.calibration.adaptation)
         factors |= misplacements(state.memory, state.stamp_ns)
@@ -177,15 +177,15 @@ class FilterAgent:
     def handle_from_elsewhere(
         self, help_: Help, team: Collection[str], frame: str, now_ns: int
     ) -> None:
-        """Takes help in another frame. In a better one the robot may find its pose by it, but only
-        by that of its `team`: no guest draws it away."""
+        """Takes help in another frame. If that frame is better, the robot may find its pose there,
+        but only by the help of its `team`: no guest may draw it into another frame."""
         frames, sender = self._frames, help_.observer if isinstance(help_, Fix) else help_.robot
         is_of_use = frames is not None and sender in team
         if not (is_of_use and frames and frames.add_help(help_, frame, self.timeline, now_ns)):
             self.counts["other_frame"] += 1
 
     def _change_frame(self, now_ns: int) -> list[FrameChanged]:
-        """Whether the robot goes on in another frame from now on."""
+        """The change to another frame, if the robot uses another one from now on."""
         if self._frames is None:
             return []
         changed = self._frames.next_change(self.timeline, now_ns)
@@ -196,8 +196,8 @@ class FilterAgent:
         return [change]
 
     def _set_pose(self, given: InitialPose) -> None:
-        """Sets the pose, unless neither a landmark nor a teammate that sees one could be seen from
-        there: then it is of another map, or in another unit."""
+        """Sets the pose, unless it is so far off the map that no landmark, nor a teammate that sees
+        one, could be seen from there: then it belongs to another map, or is in another unit."""
         if self._field.distance(given.x_m, given.y_m) > self._farthest_m:
             self.counts[OFF_FIELD] += 1
             self.refused[input_name(given), OFF_FIELD] += 1
@@ -217,7 +217,8 @@ class FilterAgent:
         return PoseEstimate(state.stamp_ns, state.reported, state.lost, speed, turn_rate)
 
     def _landmark_places(self, now_ns: int) -> list[LandmarkPlaces]:
-        """Where the shared landmarks are, by this robot and by others; nothing without any."""
+        """Where the shared landmarks are, according to this robot and to others; nothing without
+        shared landmarks."""
         if not self._shared:
             return []
         state = self.timeline.state
@@ -231,14 +232,15 @@ class FilterAgent:
         return [LandmarkPlaces(tuple(places), self.frame), *self._places_elsewhere()]
 
     def _places_elsewhere(self) -> Iterator[LandmarkPlaces]:
-        """Where the shared landmarks are in better frames, as far as teammates have said."""
+        """Where the shared landmarks are in better frames, as far as teammates have said so."""
         candidates = {} if self._frames is None else self._frames.candidates
         for frame, candidate in candidates.items():
             beliefs = candidate.timeline.state.memory.teammates.trusted_landmarks
             yield LandmarkPlaces(tuple(beliefs.values()), frame)
 
     def _frame_estimates(self, now_ns: int) -> list[FrameEstimate]:
-        """The estimate at each frame that odometry covers by now, or that waited long enough."""
+        """The estimates at the times of frames, for each frame that odometry covers by now or that
+        has waited long enough."""
         ready = []
         while self._waiting:
             stamp_ns = self._waiting[0].stamp_ns

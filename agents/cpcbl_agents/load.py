@@ -1,7 +1,8 @@
-"""Whether a robot keeps up with its inputs and its own rate: decided by counts and times, no clock.
+"""Whether a robot keeps up with its inputs and its own rate. It is decided by counts and times,
+without a clock.
 
-Who steps a robot says how much it may take in a step (`MayGoOn`). That is an input like all others,
-so a step can be repeated exactly: with `first(n)`, where n messages were taken.
+The caller of a step says how much the step may handle (`MayGoOn`). That is an input like all
+others, so a step can be repeated exactly: with `first(n)`, if n messages were handled.
 """
 
 from collections import Counter

@@ -68,7 +68,7 @@ class BoundedSteppable(Steppable, Protocol):
 
 
 class NodeStart(NamedTuple):
-    """When and as what a node starts."""
+    """When a node starts, and as which process."""
 
     stamp_ns: int  # of the robot's time
     incarnation: str  # distinguishes its process from others with the same robot's name
@@ -91,7 +91,7 @@ NO_CALLBACKS = NodeCallbacks()
 
 
 class Node:
-    """Runs a `Robot` on a `Bus`. `step` it whenever `next_ns` has come or something arrived."""
+    """Runs a `Robot` on a `Bus`. Call `step` when `next_ns` has come or something has arrived."""
 
     def __init__(
         self,
@@ -225,7 +225,7 @@ class Node:
                 self.received.of("belief", name).add(size, message.stamp_ns)
 
     def _explain(self, key: str, payload: bytes, reason: Refusal) -> None:
-        """Says once for each key and reason what is wrong with an input that came as JSON."""
+        """Logs, once for each key and reason, what is wrong with an input that came as JSON."""
         if (key, reason) in self._explained or not is_json(payload):
             return
         if problem := input_problem(key, payload):
@@ -233,8 +233,8 @@ class Node:
             log.warning("%s: refused JSON on %s: %s", self._name, key, problem)
 
     def _decode(self, key: str, payload: bytes, now_ns: int) -> Message | Refusal:
-        """The message, or why it must not be used: its bytes, its sender, then its clock, its
-        numbers and its time."""
+        """The message, or why it must not be used. The order of checks: its bytes, its sender, the
+        sender's clock, its numbers and its time."""
         message = decode_by_key(key, payload)
         match message:
             case Refusal():
@@ -272,7 +272,7 @@ class Node:
             self.robot.handle(event(bool(subscribed)), now_ns)
 
     def _check_landmark_subscribers(self, now_ns: int) -> None:
-        """Tells the robot of which landmarks teammates want to know the places."""
+        """Tells the robot which landmarks' places teammates want to know."""
         sharing = self.robot.collaboration.landmarks
         asked_for = self._declarations.update_landmarks(sharing.tiers)
         if asked_for != sharing.asked_for:

@@ -71,7 +71,7 @@ class InputSnapshot(NamedTuple):
 
 
 class RobotStart(NamedTuple):
-    """When and how a robot started: with its team's settings, what it depends on."""
+    """When and how a robot started."""
 
     stamp_ns: int
     is_pose_given: bool  # by `start` in its settings, which it does not take where it has moved
@@ -133,7 +133,7 @@ class Robot:
         self, message: Message | Tick | BusEvent, now_ns: int, frame: str = FIELD
     ) -> list[Outgoing]:
         """Everything that this robot publishes because of one message (from the bus, or a tick).
-        `frame`: in which a teammate's help is.
+        `frame`: the frame of a teammate's help.
 
         Inputs go through sensing, filter and collaboration; the filter's estimates also go to the
         waypoint follower. After the end of its log a robot publishes nothing.
@@ -158,7 +158,7 @@ class Robot:
         return self._routed([message, *self.sensing.handle(message, now_ns)], now_ns)
 
     def _routed(self, inputs: Sequence[AgentMessage], now_ns: int) -> list[Outgoing]:
-        """What is published because of what sensing makes of a message."""
+        """Everything to publish because of what sensing made of a message."""
         estimates = [out for m in inputs for out in self.filter.handle(m, now_ns)]
         outgoing = [out for m in estimates for out in self.collaboration.handle(m, now_ns)]
         outgoing += [out for m in estimates for out in self.sensing.handle(m, now_ns)]

@@ -38,7 +38,7 @@ UncorrectedInput = Odometry | Sightings | Position | InitialPose
 
 class SensingAgent:
     """Polls the source and the camera, takes a driver's messages, corrects delays and scales, and
-    leaves out what the settings say the sensor cannot see.
+    drops sightings that the settings say the sensor cannot make.
 
     `source`: a log; None where inputs arrive on the bus. `map_names`: the names of landmarks and
     walls. Every other name is a robot's: a teammate's or a guest's.
@@ -73,8 +73,9 @@ class SensingAgent:
 
     @contextmanager
     def detect_on_thread(self, wake: Callable[[], None]) -> Iterator[None]:
-        """Until the end, the detector works on a thread of its own, which calls `wake` for each of
-        its results: a tick then takes them. To be called before a node wraps the detection."""
+        """Until this context ends, the detector works on a thread of its own. It calls `wake` for
+        each of its results, which the next tick takes. Call this before a node wraps the
+        detection."""
         if self._detector is None:
             yield
             return
@@ -82,7 +83,7 @@ class SensingAgent:
             yield
 
     def wrap(self, tape: "Tape") -> None:
-        """From now on what is polled and detected passes this tape."""
+        """Lets everything that is polled and detected from now on pass through this tape."""
         if self._source is not None:
             self._source = tape.wrap_source("source", self._source)
         if self._camera is not None:
@@ -108,7 +109,7 @@ class SensingAgent:
 
     @property
     def problems(self) -> tuple[str, ...]:
-        """What the robot doubts about its camera, as sentences."""
+        """What may be wrong with the robot's camera, as sentences."""
         parts = (p for p in (self._detection, self._correction) if p is not None)
         return tuple(problem for part in parts for problem in part.problems)
 
@@ -158,13 +159,13 @@ class SensingAgent:
         return self._collect()
 
     def _collect(self) -> list[AgentMessage]:
-        """What follows from the frames that the detector has looked at by now."""
+        """The messages that follow from the frames that the detector has finished."""
         if self._detection is None:
             return []
         return [out for found in self._detection.collect() for out in self._take(found)]
 
     def _take(self, found: DetectedFrame) -> Sequence[AgentMessage]:
-        """What follows from a frame that the detector has looked at."""
+        """The messages that follow from one frame that the detector has finished."""
         outgoing: list[AgentMessage] = [] if found.annotated is None else [found.annotated]
         self._release_odometry(found.stamp_ns)
         if isinstance(found.sightings, str):
@@ -177,7 +178,7 @@ class SensingAgent:
         return [*outgoing, frame, *([] if change is None else [change])]
 
     def _add_odometry(self, piece: Odometry) -> None:
-        """Tells the check of the camera of a motion, in the order in which motions and frames were
+        """Passes a motion to the check of the camera, in the order in which motions and frames were
         measured."""
         if self._correction is None:
             return
@@ -188,7 +189,7 @@ class SensingAgent:
         self._correction.add_odometry(piece)
 
     def _release_odometry(self, until_ns: int) -> None:
-        """Tells it of the motions that were held, and were measured by then."""
+        """Passes the held motions that were measured until then to the check of the camera."""
         while self._held and self._held[0].stamp_ns <= until_ns and self._correction is not None:
             self._correction.add_odometry(self._held.pop(0))
 

@@ -37,7 +37,7 @@ class LocalizerSettings(Table, frozen=True, kw_only=True):
     not, because it does not know the accuracy of its pose."""
     paper_uncertainty: bool = False
     """As printed in the paper, the uncertainty of a position constraint does not contain that of
-    the heading (resolution a)."""
+    the heading (docs/paper.md, resolution a)."""
     weights: Weights = Weights()
     gate_probability: Annotated[float, msgspec.Meta(gt=0.5, lt=1.0)] = 0.999
     """The share of correct measurements that the gate accepts."""

@@ -55,9 +55,9 @@ def test_a_command_does_not_load_the_modules_of_the_others(command: str) -> None
         [sys.executable, "-c", code, command], stdout=subprocess.PIPE, check=True, timeout=60.0
     )
     target, *loaded = json.loads(done.stdout)
-    rooms = {name for name in loaded if name.startswith("cpcbl_launch.commands.")}
+    commands = {name for name in loaded if name.startswith("cpcbl_launch.commands.")}
     own = {f"cpcbl_launch.commands.{name}" for name in (target.partition(".")[0], "options")}
-    assert rooms == own
+    assert commands == own
 
 
 @pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="threads are counted in /proc")

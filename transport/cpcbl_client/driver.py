@@ -37,9 +37,9 @@ def odometry_from_pose(before: PoseXYH, after: PoseXYH) -> tuple[float, float]:
 class Driver:
     """Publishes odometry, sightings, positions and camera images of one robot.
 
-    A value that is certainly in a wrong unit raises InputError and is not sent. Whatever else is
-    wrong the robot refuses and counts. Times are those of the measurement; without `stamp_ns` it is
-    now.
+    A value that is certainly in a wrong unit raises InputError and is not sent. The robot itself
+    refuses and counts every other bad value. A time stamp is that of the measurement; without
+    `stamp_ns` it is the present time.
     """
 
     def __init__(
@@ -77,8 +77,8 @@ class Driver:
         *,
         stamp_ns: int | None = None,
     ) -> None:
-        """A motion of `duration_s` that ended at `stamp_ns`; None: that began where the last one
-        ended, at first where the driver started."""
+        """Publishes a motion (m, rad) that took `duration_s` and ended at `stamp_ns`. Without a
+        duration it began where the last one ended, and the first one when the driver started."""
         until_ns = self._stamp(stamp_ns)
         last_ns = self._odometry_ns
         from_ns = last_ns if duration_s is None else until_ns - int(duration_s * 1e9)
@@ -101,13 +101,14 @@ class Driver:
         bearing_sigma_rad: float | None = None,
         stamp_ns: int | None = None,
     ) -> None:
-        """One object: a landmark, a wall or a teammate, in the robot's frame (left is positive)."""
+        """Publishes one object, in the robot's frame (bearings to the left are positive): a
+        landmark, a wall or a teammate."""
         numbers = range_m, bearing_rad, range_sigma_m, bearing_sigma_rad
         seen = Sighting(name, *(None if n is None else float(n) for n in numbers))
         self.sightings([seen], stamp_ns=stamp_ns)
 
     def sightings(self, seen: Iterable[Sighting], *, stamp_ns: int | None = None) -> None:
-        """All objects of one time, such as those of one camera image."""
+        """Publishes all objects that were seen at one time, such as those of one camera image."""
         frame = Sightings(self._stamp(stamp_ns), tuple(seen))
         for one in frame.sightings:
             _require(sighting_problem(one))
@@ -117,8 +118,8 @@ class Driver:
     def position(
         self, x_m: float, y_m: float, sigma_m: float, *, stamp_ns: int | None = None
     ) -> None:
-        """A position in the field's frame by the robot's own sensor (GPS), equally good in x and
-        y."""
+        """Publishes a position in the field's frame from the robot's own sensor, such as GPS. Its
+        sigma is the same in x and y."""
         variance = float(sigma_m) ** 2
         place = float(x_m), float(y_m), (variance, 0.0, variance)
         self._put(Position(self._stamp(stamp_ns), *place))
@@ -133,9 +134,9 @@ class Driver:
         *,
         stamp_ns: int | None = None,
     ) -> None:
-        """Where the robot is, as somebody says: it replaces what the robot believed. The σ are
-        those of RViz, where a person gives the pose with the mouse. Waits until a robot takes it,
-        at most 2 s: it is sent once."""
+        """Says where the robot is, which replaces what the robot believed. The default sigmas are
+        those of RViz, where a person sets the pose with the mouse. The message is sent once, so
+        this waits at most 2 s for a robot that takes it."""
         p, h = float(sigma_m) ** 2, float(heading_sigma_rad) ** 2
         pose = float(x_m), float(y_m), float(heading_rad)
         given = InitialPose(self._stamp(stamp_ns), *pose, (p, 0.0, p, 0.0, 0.0, h))
@@ -148,7 +149,7 @@ class Driver:
         self._put(given)
 
     def frame(self, image: bytes, *, stamp_ns: int | None = None) -> None:
-        """A camera image (JPEG or PNG) at the time of its exposure."""
+        """Publishes a camera image (JPEG or PNG) with the time of its exposure."""
         self._put(Frame(self._stamp(stamp_ns), image))
 
     def close(self) -> None:
@@ -185,8 +186,8 @@ class Driver:
             self._check_listener(kind)
 
     def _check_listener(self, kind: type[SensorInput]) -> None:
-        """Says when no robot takes the messages: it is not there yet, or in another team; and when
-        a second driver feeds the same robot."""
+        """Warns while no robot takes the messages, because it is not there yet or in another team,
+        and while a second driver publishes for the same robot."""
         if self._others:
             keys = ", ".join(sorted(self._others))
             self._others.clear()

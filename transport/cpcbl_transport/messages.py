@@ -208,7 +208,7 @@ class Drive(msgspec.Struct, frozen=True, array_like=True, tag="drive"):
 
 
 class SimulatedRobotModel(msgspec.Struct, frozen=True, array_like=True):
-    """All that the simulated field must know of a guest, which tells it (`Join`)."""
+    """All that the simulated field must know of a guest. The guest tells it (`Join`)."""
 
     start: StartModel
     sensor: SensorModel = SensorModel()
@@ -229,7 +229,7 @@ def settings_from_model(model: SimulatedRobotModel) -> RobotSettings:
 
 
 class Join(msgspec.Struct, frozen=True, array_like=True, tag="join"):
-    """A guest asks the simulated field, again and again, to simulate it; None: it leaves."""
+    """A guest asks the simulated field, again and again, to simulate it. No `model`: it leaves."""
 
     robot: Name
     incarnation: str
@@ -357,7 +357,7 @@ def refusal(message: Message, now_ns: int) -> Refusal | None:
 
 
 def _numbers(message: msgspec.Struct) -> list[float]:
-    """All numbers in a message that are no integers, however deep."""
+    """All floating-point numbers in a message, at any depth."""
     found: list[float] = []
     parts: list[object] = [message]
     for part in parts:  # the list grows meanwhile
@@ -370,7 +370,7 @@ def _numbers(message: msgspec.Struct) -> list[float]:
 
 
 def _has_large_integer(message: msgspec.Struct) -> bool:
-    """Whether a count, however deep, or a time is larger than any can be. The name of a time ends
+    """Whether a count, at any depth, or a time is larger than any can be. The name of a time ends
     with `_ns`."""
     parts: list[object] = [message]
     for part in parts:  # the list grows meanwhile

@@ -16,10 +16,8 @@ FAR_FIELDS, FAR_M = 3.0, 20.0  # from the map: nobody drives so far away from it
 LEAST_TURN = 0.15
 LARGEST_DEGREE = 1e-4  # for a metre
 AGREE = 0.35  # how much distances by odometry and by positions may differ
-OTHER_ORIGIN = (
-    "are far from the map: another origin, or latitude and longitude; metres of the field"
-)
-OTHER_PLACE = "are not where odometry is since the start: another origin, or latitude and longitude"
+OTHER_ORIGIN = "are far from the map: another origin, or latitude and longitude in place of metres"
+OTHER_PLACE = "do not fit odometry since the start: another origin, or latitude and longitude"
 DEGREES = "look like latitude and longitude; they must be metres of the field"
 
 

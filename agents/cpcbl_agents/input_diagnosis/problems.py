@@ -50,7 +50,7 @@ REASONS = {
     "implausible_number": "numbers are too large; they must be in metres, radians, nanoseconds",
     "not_a_covariance": "the covariance is not valid; xx > 0, yy > 0 and xy² <= xx yy must hold",
     "from_the_future": "stamps are in the future",
-    "impossible_duration": "pieces last no time, or more than 10 s",
+    "impossible_duration": "pieces have no duration, or more than 10 s",
     "too_late": "messages come more than 2 s late, or out of order",
     "duplicate": "the same message comes twice; two drivers?",
     "unknown_object": "names that are not in the team file",

@@ -30,7 +30,7 @@ def access(
         str,
         Option(help="Common names of the certificates of robots' nodes; default: robot/r1, ..."),
     ] = "",
-    bridge: Annotated[str, Option(help="Those of the bridge's certificates.")] = "bridge",
+    bridge: Annotated[str, Option(help="Common names of the bridge's certificates.")] = "bridge",
 ) -> None:
     """Print the access control of a router of ROS 2 (rmw_zenohd) that lets the bridge and robots'
     nodes in, and nobody else."""

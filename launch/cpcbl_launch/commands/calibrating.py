@@ -93,7 +93,7 @@ Recordings = Annotated[
 ]
 PoseFolder = Annotated[Path | None, Option(help="Or a folder of pictures that a robot took.")]
 Poses = Annotated[
-    Path | None, Option(help="Where (CSV): file, x_m, y_m, heading_deg, and robot for teammates.")
+    Path | None, Option(help="CSV of its poses: file, x_m, y_m, heading_deg; robot for teammates.")
 ]
 Observer = Annotated[
     str | None, Option(help="Robot whose camera it is; default: all with a camera.")
@@ -134,13 +134,13 @@ def camera(
     words: BoardPictures = None,
     board: BoardOption = "charuco",
     squares: Annotated[str, Option(help="Across and down, black and white.")] = "7x5",
-    square_m: Annotated[float, Option(min=0.001, help="Side of a square.")] = 0.03,
+    square_m: Annotated[float, Option(min=0.001, help="Side of a square of the board.")] = 0.03,
     marker_m: Annotated[float, Option(help="Side of a marker (charuco).")] = 0.022,
-    family: Annotated[str, Option(help="Of the markers (charuco).")] = "aruco_4x4_50",
+    family: Annotated[str, Option(help="Family of the markers (charuco).")] = "aruco_4x4_50",
     every: Annotated[float, Option(min=0.0, help="Seconds between two frames of a video.")] = 0.5,
     print_board: PrintBoard = None,
-    robot: Annotated[str | None, Option(help="Into this robot's table, or")] = None,
-    kind: Annotated[str | None, Option("--type", help="into this robot type's.")] = None,
+    robot: Annotated[str | None, Option(help="Write into this robot's table.")] = None,
+    kind: Annotated[str | None, Option("--type", help="Or into this robot type's table.")] = None,
     output: ToFile = None,
     picture: Residuals = None,
     as_json: AsJson = False,

@@ -51,7 +51,7 @@ Speed = Annotated[
     float | None,
     Option(
         callback=options.check_callback(_require_speed),
-        help="Times real time; default: as fast as the machine is; with --view 1.",
+        help="Speed, in times real time; default: as fast as the machine is; with --view 1.",
     ),
 ]
 

@@ -46,7 +46,10 @@ UpDuration = Annotated[
 ]
 Speed = Annotated[
     float,
-    Option(callback=options.check_callback(_require_speed), help="Times real time, at least 0.05."),
+    Option(
+        callback=options.check_callback(_require_speed),
+        help="Speed, in times real time; at least 0.05.",
+    ),
 ]
 Robots = Annotated[str, Option(help="Robots to start on this machine; default: all.")]
 ProcessLogs = Annotated[

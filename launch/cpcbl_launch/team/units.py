@@ -133,7 +133,7 @@ def unit_text(value: float, usual: Usual, key: str = "") -> str:
     size = abs(value)
     if not value or usual.least <= size <= usual.most:
         return ""
-    within = f"{value:g} is unusual, for it is mostly {usual.least:g} to {usual.most:g}"
+    within = f"{value:g} is unusual: it is mostly {usual.least:g} to {usual.most:g}"
     fits = {u: f for u, f in usual.units.items() if usual.least <= size * f <= usual.most}
     likely = [
         f"{unit}, write {value * factor:.4g}"

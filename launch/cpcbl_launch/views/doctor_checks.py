@@ -80,7 +80,7 @@ def _team_file(facts: Facts) -> Iterator[tuple[Level, str, str]]:
     if not facts.file:
         yield "note", "no team file was named", "cpcbl-team doctor TEAM; `init` writes one"
     for problem in facts.file_problems:
-        yield "error", problem, "mend the file; cpcbl-team check TEAM looks again"
+        yield "error", problem, "correct the file; cpcbl-team check TEAM checks it again"
     for warning in facts.file_warnings:
         yield "warning", warning, ""
     if facts.team and not facts.file_warnings:
@@ -125,13 +125,13 @@ def _router(facts: Facts) -> Iterator[tuple[Level, str, str]]:
     start = f"cpcbl-team router {facts.file or 'TEAM'} on its machine"
     remedies = {
         "refused": ("the machine is there, but nothing listens at this port", start),
-        "unknown host": ("no machine has this name", "write its address, or mend the name"),
+        "unknown host": ("no machine has this name", "write its address, or correct the name"),
         "silent": (
             "no answer: no such machine, another network, or a firewall",
             "ping the address; open the port; see transport.connect",
         ),
         "open": (
-            "something listens there, but it is no router of this kind: another program, another"
+            "something listens there, but no router that this one can use: another program, another"
             f" version of Zenoh, or other security ({facts.router_problem})",
             "see what uses the port (ss -ltnp); use the same version and security on all machines",
         ),

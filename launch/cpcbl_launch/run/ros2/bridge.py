@@ -157,7 +157,7 @@ class TeamBridge:
             return []
         topics = {e.topic for e in self._node.endpoints() if e.type_name == types.APRIL_TAGS}
         return [
-            f"{topic}: is not read, for the team file has no tags: add markers or ros2.tags"
+            f"{topic}: is not read, because the team file has no tags: add markers or ros2.tags"
             for topic in sorted(topics)
         ]
 

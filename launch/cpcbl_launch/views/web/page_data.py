@@ -245,7 +245,7 @@ def notice_text(now: Snapshot, team: str, where: str, now_s: float) -> str:
     elsewhere = sorted(n for n, track in tracks.items() if track and track.frame != shown)
     if elsewhere:
         return (
-            f"Drawn is frame {frame_text(shown)}. Not drawn, for nobody knows yet where their"
+            f"Drawn is frame {frame_text(shown)}. Not drawn, because nobody knows yet where their"
             f" frames are: {', '.join(elsewhere)}."
         )
     return ""
