@@ -128,6 +128,7 @@ class Localizer:
         else:
             state, estimate = self._common.correct(state, gated.accepted)
         state = self._with_frame(state, estimate, landmarks, gated, scope)
+        state = self.screen.own.without_misleading(state)
         if self._stationary.is_active:
             parts = prior, landmarks.evidence, gated.accepted
             state = self._stationary.after_frame(state, *parts)

@@ -21,6 +21,6 @@ def with_mended_inputs(state: State, event: InputsMended) -> State:
         trusted=None, mistake="", suspected_ns=-1, misplaced={}
     )
     state = with_recovery(state, recovery)
-    teammates = state.memory.teammates
+    teammates = state.memory.teammates._replace(own=None)
     senders = forgive(teammates.senders, event.stamp_ns, event.since_ns)
     return with_teammates(state, with_senders(teammates, senders))

@@ -246,7 +246,7 @@ class Recovery:
         common, filters = calibration.common, calibration.filters
         memory = memory._replace(
             recovery=recovery,
-            teammates=teammates._replace(senders=senders),
+            teammates=teammates._replace(senders=senders, own=None),
             calibration=calibration._replace(
                 references=None,
                 filters=filters if all(f.used >= DETERMINED for f in filters) else (),

@@ -104,6 +104,8 @@ class TeammateReport(NamedTuple):
     is_guest: bool = False  # whether its sender is no robot of the team
     heading: tuple[float, float] | None = None
     """The reported heading minus the estimated one, rad, and its variance; None without one."""
+    own_nis: float = 0.0
+    """Against the pose by own sensors, scaled like `nis`; 0 without one."""
 
 
 class Rival(NamedTuple):
@@ -145,6 +147,7 @@ class SenderRecord(msgspec.Struct, frozen=True, gc=False):
     rivals: tuple[Rival, ...] = ()
     """With whom it is in a contest, until that is decided: also while either is silent."""
     wrong_ns: int = NEVER_NS  # since when others say without interruption that its mean is wrong
+    own_nis: float = 0.0  # of its last report, against the pose by own sensors
     confirmed: int = 0  # reports beside which another source agreed with it
     is_guest: bool = False
     headings: FadingTurns = NO_TURNS  # that it reported
@@ -156,8 +159,8 @@ def with_report(record: SenderRecord, report: TeammateReport, limit: float) -> S
     if record.score and report.stamp_ns - record.last_report_ns > SILENCE_NS:
         record = replace(record, score=0.0)
     record = _with_position(_with_faded_conflicts(record, report.stamp_ns), report.position)
-    last_ns = max(record.last_report_ns, report.stamp_ns)
-    record = replace(record, last_report_ns=last_ns, is_guest=report.is_guest)
+    last_ns, own_nis = max(record.last_report_ns, report.stamp_ns), report.own_nis
+    record = replace(record, last_report_ns=last_ns, is_guest=report.is_guest, own_nis=own_nis)
     if report.nis is None:
         return record
     if report.heading is not None:

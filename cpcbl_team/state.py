@@ -20,6 +20,7 @@ from cpcbl_team.estimate import HEADING, POSE, POSITION, ZERO3, Covariance3, Est
 from cpcbl_team.geometry import Pose2, new, wrap_angle
 from cpcbl_team.inputs import Belief, LandmarkBelief, Odometry, Sighting
 from cpcbl_team.miscalibration import with_doubts
+from cpcbl_team.own_pose import OwnPose
 from cpcbl_team.scale_errors import with_scales_doubted
 from cpcbl_team.sender_records import SenderRecord
 
@@ -150,6 +151,7 @@ class TeammateMemory(NamedTuple):
     senders: Mapping[str, SenderRecord] = _NONE  # teammates, and the robot's own sensors
     last_report_ns: int = _NEVER_NS
     landmarks: Mapping[str, LandmarkBelief] = _NONE  # the best belief about each
+    own: OwnPose | None = None  # where the robot is without them
 
     @property
     def trusted_landmarks(self) -> Mapping[str, LandmarkBelief]:
@@ -277,10 +279,10 @@ def with_memory(state: State, memory: Memory) -> State:
 
 def with_beliefs(state: State, beliefs_of: State) -> State:
     """The state with the beliefs of another one, and when the latest report of both came."""
-    _, senders, last_ns, landmarks = state.memory.teammates
-    beliefs, _, other_ns, _ = beliefs_of.memory.teammates
+    _, senders, last_ns, landmarks, own = state.memory.teammates
+    beliefs, _, other_ns, _, _ = beliefs_of.memory.teammates
     last_ns = other_ns if other_ns > last_ns else last_ns
-    return with_teammates(state, new(TeammateMemory, (beliefs, senders, last_ns, landmarks)))
+    return with_teammates(state, new(TeammateMemory, (beliefs, senders, last_ns, landmarks, own)))
 
 
 def with_belief(state: State, belief: Belief, now_ns: int, oldest_ns: int) -> State:
@@ -318,8 +320,8 @@ def with_teammates(state: State, teammates: TeammateMemory) -> State:
 
 def with_senders(teammates: TeammateMemory, senders: Mapping[str, SenderRecord]) -> TeammateMemory:
     """The memory of teammates with these records of senders."""
-    beliefs, _, last_ns, landmarks = teammates
-    return new(TeammateMemory, (beliefs, senders, last_ns, landmarks))
+    beliefs, _, last_ns, landmarks, own = teammates
+    return new(TeammateMemory, (beliefs, senders, last_ns, landmarks, own))
 
 
 def with_recovery(state: State, recovery: RecoveryMemory) -> State:
@@ -338,6 +340,7 @@ def at_new_pose(state: State, estimate: Estimate) -> State:
     """The state at a pose that does not follow from the one before."""
     memory = state.memory.calibration
     state = with_calibration(state, memory._replace(scales=memory.scales.at_new_pose()))
+    state = with_teammates(state, state.memory.teammates._replace(own=None))
     return state._replace(estimate=estimate)
 
 

@@ -19,6 +19,7 @@ from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.inflation import inflate_by_offset, inflate_to
 from cpcbl_team.inputs import Belief, Input, LandmarkBelief, Position, Sightings
 from cpcbl_team.landmarks import LandmarkUpdate
+from cpcbl_team.led_astray import OwnPoses
 from cpcbl_team.mean_offsets import (
     HEADING_VARIANCE,
     NOTHING,
@@ -70,6 +71,7 @@ class TeammateScreen:
         self._localizer_rules = settings.localizer
         self._gates = gates
         o = settings.odometry
+        self.own = OwnPoses(o)
         self._odometry_errors = o.distance_sigma_m_per_sqrt_m**2, o.distance_scale_sigma
         self.is_active = self._rules.enabled and is_probabilistic
 
@@ -97,6 +99,8 @@ class TeammateScreen:
             sums = combine(Information.of(landmarks.evidence.sums()), gated.accepted)
             own = _own_offset(state, sums, gated.accepted)
             state = self._with_own_sensors(state, accepted, rejected, own)
+            if accepted and state.common_errors is None:
+                state = self.own.after_frame(state, sums)
         state, distrusted = self._screen_reports(state, gated)
         if distrusted:
             gated = GatedObjects(*(_without(objects, distrusted) for objects in gated))
@@ -118,13 +122,15 @@ class TeammateScreen:
             beliefs = state.memory.teammates.beliefs
             is_fresh = not is_teammate or _has_fresh(beliefs[sender], now)
             of_two, evidence, (first, *_) = None, None, objects
-            if is_fresh and not state.lost:
+            if is_fresh and not state.lost and not self.own.is_guessed(state):
                 freedom = sum(len(found.constraints) for found in objects)
                 of_two = 2.0 * sum(found.nis for found in objects) / freedom
                 if first.observation:
                     of_it = self._evidence(state, first.observation)
                     evidence = _with_camera(state, first.measurement, of_it)
             report = TeammateReport(now, of_two, evidence=evidence, is_guest=self._is_guest(sender))
+            if first.observation:
+                report = report._replace(own_nis=self.own.nis(state, first.observation))
             state, is_trusted = self._assess(state, sender, report, first.measurement.source)
             if not is_trusted:
                 distrusted.add(sender)
@@ -208,6 +214,7 @@ class TeammateScreen:
         squared. The robot's own position sensor is always used.
         """
         now, is_lost = state.stamp_ns, bool(state.memory.recovery.lost)
+        is_guessed = self.own.is_guessed(state)
         if observation.observer is None:
             if self.has_recent_reports(state, now) and not is_lost:
                 is_accepted = nis <= self._gates[1]
@@ -227,12 +234,13 @@ class TeammateScreen:
         where = now, observation.x, observation.y, variance, odometry_from_robot, turn_rad
         report = TeammateReport(
             now,
-            None if is_lost else nis,
+            None if is_lost or is_guessed else nis,
             (ex, ey),
-            ReportedPosition(*where, *self._odometry_errors),
+            None if is_guessed else ReportedPosition(*where, *self._odometry_errors),
             _evidence_at(state, position.information(position.noise(0.0)), position.dependent),
             self._is_guest(observation.sender),
             of_heading,
+            self.own.nis(state, position),
         )
         return self._assess(state, observation.sender, report, observation.source)
 

@@ -72,7 +72,7 @@ LEAST_UNITED: Final = 2  # teammates that agree with each other against the esti
 MAJORITY_NS: Final = 20_000_000_000  # most senders are not found wrong within so short a time
 
 # The reasons that rest on what other senders reported
-_BY_COMPARISON = QuarantineReason.BIASED, QuarantineReason.OVERCONFIDENT, QuarantineReason.OUTVOTED
+BY_COMPARISON = QuarantineReason.BIASED, QuarantineReason.OVERCONFIDENT, QuarantineReason.OUTVOTED
 
 
 class TrustDecision(NamedTuple):
@@ -249,7 +249,7 @@ def _quarantine(senders: SenderRecords, name: str, now_ns: int, used_ns: int) ->
     changed = {**senders, name: quarantined(record, reason_of(record), now_ns)}
     if record.odometry_conflicts > MOST_CONFLICTS:  # the senders that it contradicted may be right
         for other, accused in senders.items():
-            if accused.reason in _BY_COMPARISON and accused.since_ns > now_ns - SILENCE_NS:
+            if accused.reason in BY_COMPARISON and accused.since_ns > now_ns - SILENCE_NS:
                 changed[other] = released(accused, now_ns)
                 errors_m.append(math.hypot(*accused.mean_offset))
     return TrustDecision(changed, False, "quarantined", frozenset((name,)), max(errors_m))
@@ -276,7 +276,7 @@ def _outvoted_majority(decision: TrustDecision, now_ns: int) -> frozenset[str]:
     out = frozenset(
         n
         for n, r in recent.items()
-        if r.reason in _BY_COMPARISON
+        if r.reason in BY_COMPARISON
         and now_ns - r.since_ns <= MAJORITY_NS
         and all(math.dist(r.mean_offset, o) <= ALIKE_M + 0.5 * math.hypot(*o) for o in new)
     )
@@ -372,7 +372,7 @@ def forgive(senders: SenderRecords, now_ns: int, since_ns: int = 0) -> SenderRec
     """The records after the robot found an error of its own, which it has had since then: what
     disagreed with its estimate may have been right. An older quarantine has another cause, unless
     nobody else is left: then the error began before it was found."""
-    blamed = {n: r for n, r in senders.items() if r.reason in _BY_COMPARISON}
+    blamed = {n: r for n, r in senders.items() if r.reason in BY_COMPARISON}
     caused = {n for n, r in blamed.items() if r.since_ns >= since_ns}
     if all(r.reason and n not in caused for n, r in senders.items()):
         caused = set(blamed)

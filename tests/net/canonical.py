@@ -60,6 +60,9 @@ def canonical_state(localizer: Localizer, state: State, with_evidence: bool) -> 
             "anchors": _calibration_anchors(calibration),
         },
         "trust": {sender or "own sensors": _sender(v) for sender, v in teammates.senders.items()},
+        "own_pose": None
+        if teammates.own is None
+        else [teammates.own.stamp_ns, _estimate(teammates.own.estimate)],
         "beliefs": {
             name: [_belief(b) for b in beliefs] for name, beliefs in teammates.beliefs.items()
         },

@@ -35,10 +35,12 @@ class LyingObserver:
         self, bus: Bus, name: str, victims: Sequence[str], fault: Fault, seed: int, sends: str
     ) -> None:
         """`sends`: "fixes", "headings" (fixes with a heading), "gated" (fixes within the gate of
-        the victim's own pose) or "beliefs"."""
+        the victim's own pose), "echoes" (the victim's own pose in place of the truth) or
+        "beliefs"."""
         self.next_ns = 0
         self.waiting = False
         self._name, self._sends = name, sends
+        self._from_ns = round(fault.from_s * 1e9)
         self._injector = FaultInjector(fault, name, 0)
         self._random = random.Random(f"{name} {seed}")
         self._truths: Truths | None = None
@@ -49,7 +51,7 @@ class LyingObserver:
         self._fixes = {robot: bus.publisher(k, topics.FIX.qos) for robot, k in keys.items()}
         self._subscriber = Subscriber(bus, Truths, self._on_message)
         self._poses: dict[str, Pose] = {}
-        if sends == "gated":
+        if sends in ("gated", "echoes"):
             self._pose_subscriber = Subscriber(bus, Pose, self._on_pose)
 
     def leave(self) -> None:
@@ -77,12 +79,17 @@ class LyingObserver:
     def _lie(self, message: Belief | Fix) -> bytes:
         altered = self._injector.alter(message)
         pose = self._poses.get(altered.robot)
-        if isinstance(altered, Fix) and pose is not None and pose.covariance is not None:
+        if self._sends != "gated" or not isinstance(altered, Fix):
+            return encode_help(altered)
+        if pose is not None and pose.covariance is not None:
             altered = _within_gate(altered, pose, pose.covariance)
         return encode_help(altered)
 
     def _fix_of(self, truth: Truth, stamp_ns: int) -> Fix:
-        x, y = (v + self._random.gauss(0.0, SIGMA_M) for v in (truth.x_m, truth.y_m))
+        seen: Truth | Pose = truth
+        if self._sends == "echoes" and stamp_ns >= self._from_ns:
+            seen = self._poses.get(truth.robot, truth)
+        x, y = (v + self._random.gauss(0.0, SIGMA_M) for v in (seen.x_m, seen.y_m))
         half = 0.5 * SIGMA_M**2
         fix = Fix(truth.robot, self._name, stamp_ns, x, y, (half, 0.0, half), (half, 0.0, half))
         if self._sends != "headings":

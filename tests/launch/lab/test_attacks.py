@@ -99,6 +99,17 @@ def test_a_guest_of_ever_new_names_leads_nobody_astray_beside_one_correct_observ
     assert row.false_quarantines == 0
 
 
+def test_those_who_echo_its_own_pose_lead_no_robot_with_eyes_astray() -> None:
+    """They kept the estimate back along an axis that the present landmark did not measure, faster
+    than the means of some seconds could tell: both correct observers came into quarantine."""
+    attack = replace(EVERY["echo", "navigator"], end_s=24.0)
+    _, row = rows_of([attack], [7])
+    assert row.noticed == 1
+    assert row.worst_ratio < 1.6  # 9.8 before
+    assert row.least_inside_3_sigma > 0.9  # 73 % before
+    assert row.false_quarantines == 0
+
+
 @pytest.mark.thorough
 def test_the_runs_to_compare_with_have_no_liar(short: dict[tuple[str, str], AttackRow]) -> None:
     for key in (("", "scout"), ("", "navigator")):

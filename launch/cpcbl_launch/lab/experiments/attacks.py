@@ -96,6 +96,7 @@ def attacks() -> tuple[Attack, ...]:
         Attack(name="beliefs", lie=DRIFT, sends="beliefs"),
         Attack(name="headings", lie="heading:1.0,1.0", sends="headings"),
         Attack(name="one axis", lie=ONE_AXIS, sends="gated"),
+        Attack(name="echo", lie=DRIFT, sends="echoes"),
     )
     cases = [replace(kind, liars=ONE) for kind in kinds]
     cases += [replace(kind, liars=TWO, **NAVIGATOR) for kind in kinds]

@@ -1,0 +1,58 @@
+"""Where a robot is by its own sensors and odometry alone, without the help of teammates.
+
+Help moves the estimate, also where it is wrong. What the robot's own sensors said some seconds ago
+was about another estimate then, and along an axis that they do not measure at present nothing of
+theirs would contradict. So this pose is the reference that no help can move: that of the estimate
+when the first help came, after the odometry and the own sensors since then. Along an axis that
+these do not measure it becomes uncertain, as it should.
+"""
+
+import math
+from typing import Final, NamedTuple
+
+from cpcbl_team.config import OdometryNoise
+from cpcbl_team.estimate import Estimate, Sums, merge, pose_difference
+from cpcbl_team.geometry import Pose2
+from cpcbl_team.miscalibration import Adaptation
+from cpcbl_team.motion import move
+
+MOST_SIGMA_M: Final = 0.5  # a pose that is less certain, or its heading, is no reference
+MOST_SIGMA_RAD: Final = math.radians(15.0)
+LONGEST_NS: Final = 3_000_000_000  # without own sensors: then it begins anew
+
+
+class OwnPose(NamedTuple):
+    """A pose that no teammate has a part in."""
+
+    stamp_ns: int
+    estimate: Estimate
+    odometry_from_robot: Pose2  # dead reckoning at that time
+    adaptation: Adaptation  # the settings with which it was found
+    gaps: int  # of the odometry until then
+
+    @property
+    def is_known(self) -> bool:
+        """Whether own sensors and odometry say where the robot is."""
+        estimate = self.estimate
+        is_placed = estimate.position_sigma_m <= MOST_SIGMA_M
+        return is_placed and estimate.heading_sigma_rad <= MOST_SIGMA_RAD
+
+    def at(self, stamp_ns: int, odometry_from_robot: Pose2, noise: OdometryNoise) -> "OwnPose":
+        """The same later, by odometry. The path is nearly an arc, for it is short."""
+        way = self.odometry_from_robot.inverse() @ odometry_from_robot
+        distance = math.copysign(math.hypot(way.x, way.y), way.x)
+        moved = move(self.estimate, distance, way.heading, noise)
+        moved = moved._replace(pose=self.estimate.pose @ way)
+        return self._replace(
+            stamp_ns=stamp_ns, estimate=moved, odometry_from_robot=odometry_from_robot
+        )
+
+    def with_evidence(self, about: Pose2, evidence: Sums) -> "OwnPose":
+        """With what own sensors say of the offset of the robot from the pose `about`, at which they
+        were linearized."""
+        (xx, xy, yy, xh, yh, hh), (x, y, h) = evidence
+        dx, dy, dh = pose_difference(about, self.estimate.pose)
+        x -= xx * dx + xy * dy + xh * dh
+        y -= xy * dx + yy * dy + yh * dh
+        h -= xh * dx + yh * dy + hh * dh
+        return self._replace(estimate=merge(self.estimate, (evidence[0], (x, y, h))))

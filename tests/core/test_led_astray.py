@@ -1,0 +1,153 @@
+"""Help that leads the estimate away from where the robot's own sensors say that it is."""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import pytest
+from msgspec.structs import replace
+from support.core import (
+    LOOP_START,
+    SECOND,
+    diagonal,
+    driven,
+    fix,
+    frame,
+    localizer,
+    loop,
+    position_error,
+)
+
+from cpcbl_team.config import OdometrySettings, Start
+from cpcbl_team.estimate import Estimate, Information
+from cpcbl_team.geometry import Pose2
+from cpcbl_team.inputs import Odometry
+from cpcbl_team.led_astray import misleading, with_misleading
+from cpcbl_team.miscalibration import AS_CONFIGURED
+from cpcbl_team.motion import turn_variance
+from cpcbl_team.own_pose import OwnPose
+from cpcbl_team.sender_comparisons import OWN_SENSORS
+from cpcbl_team.sender_records import QuarantineReason, SenderRecord
+from cpcbl_team.state import State
+
+NOW_NS = 100 * SECOND
+NOISE = OdometrySettings(distance_sigma_m_per_sqrt_m=0.1, turn_sigma_rad_per_sqrt_m=0.1)
+ROBOT = localizer(odometry=NOISE, start=Start(x_m=LOOP_START.x, y_m=LOOP_START.y))
+OWN = Estimate(Pose2(1.0, 2.0, 0.3), diagonal(0.05, 0.05))
+
+
+def estimate_at(x: float) -> Estimate:
+    """One that is so far (m) from the pose by own sensors, and sure of it."""
+    return OWN._replace(pose=Pose2(1.0 + x, 2.0, 0.3), covariance=diagonal(0.02, 0.02))
+
+
+class Driven(NamedTuple):
+    state: State
+    truth: Pose2
+
+
+def says(own_nis: float, *, ago_s: float = 0.1) -> SenderRecord:
+    return SenderRecord(last_report_ns=NOW_NS - int(ago_s * SECOND), own_nis=own_nis)
+
+
+TWO_OF_FOUR = {"a": says(1.0), "b": says(3.0), "c": says(30.0), "d": says(20.0)}
+
+
+def test_those_that_contradict_own_sensors_led_an_estimate_astray_that_does_too() -> None:
+    senders = {**TWO_OF_FOUR, OWN_SENSORS: says(0.0)}
+    assert misleading(senders, estimate_at(0.3), OWN, NOW_NS) == {"c", "d"}
+    assert misleading(senders, estimate_at(0.15), OWN, NOW_NS) == set()
+
+
+def test_nobody_is_blamed_where_nobody_contradicts_own_sensors_as_clearly_as_the_estimate() -> None:
+    """Own sensors were off by chance, and a correct observer by 14."""
+    senders = {**TWO_OF_FOUR, "c": says(15.0), "d": says(16.0)}
+    assert misleading(senders, estimate_at(0.3), OWN, NOW_NS) == set()
+    assert misleading({**senders, "d": says(19.0)}, estimate_at(0.3), OWN, NOW_NS) == {"c", "d"}
+
+
+def test_whoever_is_silent_or_in_quarantine_leads_nobody_astray() -> None:
+    for change in (says(30.0, ago_s=5.0), replace(says(30.0), reason=QuarantineReason.BIASED)):
+        senders = {**TWO_OF_FOUR, "c": change}
+        assert misleading(senders, estimate_at(0.3), OWN, NOW_NS) == {"d"}
+
+
+def test_against_most_senders_own_sensors_need_twice_the_chi_square() -> None:
+    senders = {"a": says(1.0), "c": says(40.0), "d": says(50.0)}
+    assert misleading(senders, estimate_at(0.25), OWN, NOW_NS) == set()
+    assert misleading(senders, estimate_at(0.4), OWN, NOW_NS) == {"c", "d"}
+    doubtful = {**senders, "c": says(30.0)}
+    assert misleading(doubtful, estimate_at(0.4), OWN, NOW_NS) == {"d"}
+
+
+def test_whom_they_made_look_wrong_of_late_is_released() -> None:
+    blamed = {
+        "a": replace(says(1.0), reason=QuarantineReason.BIASED, since_ns=NOW_NS - SECOND),
+        "b": replace(says(1.0), reason=QuarantineReason.BIASED, since_ns=NOW_NS - 60 * SECOND),
+        "e": replace(says(50.0), reason=QuarantineReason.BIASED, since_ns=NOW_NS - SECOND),
+    }
+    found = with_misleading({**TWO_OF_FOUR, **blamed}, frozenset({"c"}), NOW_NS)
+    reasons = {name: record.reason for name, record in found.items()}
+    biased, outvoted = QuarantineReason.BIASED, QuarantineReason.OUTVOTED
+    assert reasons == {"a": None, "b": biased, "c": outvoted, "d": None, "e": biased}
+    assert found["c"].last_failure_ns == NOW_NS  # it is not released at once
+    assert found["c"].quarantines == 1
+
+
+def test_evidence_about_another_pose_is_the_same_evidence() -> None:
+    own = OwnPose(0, OWN, Pose2(0.0, 0.0, 0.0), AS_CONFIGURED, 0)
+    row, variance = (0.6, 0.8, 0.5), 0.01
+    about = Pose2(1.2, 1.9, 0.35)
+    here = Information.none().add(row, 0.1, variance)
+    moved = 0.1 - (0.6 * 0.2 - 0.8 * 0.1 + 0.5 * 0.05)
+    there = Information.none().add(row, moved, variance)
+    found, expected = own.with_evidence(about, there), own.with_evidence(OWN.pose, here)
+    assert found.estimate.pose == pytest.approx(expected.estimate.pose)
+    assert found.estimate.covariance == pytest.approx(expected.estimate.covariance)
+
+
+def test_without_sensors_it_follows_odometry_and_becomes_uncertain() -> None:
+    own = OwnPose(0, OWN, Pose2(5.0, 5.0, 1.0), AS_CONFIGURED, 0)
+    place = Pose2(5.0, 5.0, 1.0) @ Pose2(0.4, 0.1, 0.2)
+    later = own.at(SECOND, place, NOISE)
+    assert later.estimate.pose == pytest.approx(OWN.pose @ Pose2(0.4, 0.1, 0.2))
+    way = math.hypot(0.4, 0.1)
+    assert later.estimate.covariance.hh == pytest.approx(0.05**2 + turn_variance(way, 0.2, NOISE))
+    assert later.estimate.position_sigma_m > OWN.position_sigma_m
+    assert later.is_known
+    lost = later._replace(estimate=OWN._replace(covariance=diagonal(1.0, 0.05)))
+    assert not lost.is_known
+
+
+def drive(seconds: float, off_m: float = 0.0, names: Sequence[str] | None = None) -> Driven:
+    """A robot that sees these landmarks, and whose teammate reports a place so far off in x."""
+    state, truth = ROBOT.start(0), LOOP_START
+    for piece, truth in driven(LOOP_START, loop()[: round(10 * seconds)]):
+        state = ROBOT.add_odometry(state, piece)
+        state = ROBOT.cycle(state, frame(truth, piece.stamp_ns, names=names))
+        place = truth.x + off_m, truth.y
+        state = ROBOT.add_fix(state, fix(*place, piece.stamp_ns, sensor_m=0.01, observer_m=0.01))
+    return Driven(state, truth)
+
+
+def test_help_does_not_move_the_pose_by_own_sensors() -> None:
+    state, truth = drive(3.0, 0.1, [next(iter(ROBOT.field.landmarks))])
+    own = state.memory.teammates.own
+    assert own is not None
+    assert position_error(own.estimate, truth) < 0.02
+    assert position_error(state.estimate, truth) > 0.05
+
+
+@pytest.mark.parametrize("has_odometry", [True, False])
+def test_nobody_is_to_blame_for_a_guess_of_a_robot_without_odometry(has_odometry: bool) -> None:
+    state, truth = drive(3.0)
+    begin_ns = state.stamp_ns
+    for i in range(1, 4):
+        now_ns = begin_ns + i * SECOND // 5
+        if has_odometry:
+            before_ns = now_ns - SECOND // 5
+            state = ROBOT.add_odometry(state, Odometry(before_ns, now_ns, 0.0, 0.0))
+        state = ROBOT.add_fix(state, fix(truth.x, truth.y + 1.5, now_ns))
+    record = state.memory.teammates.senders["mate"]
+    assert (record.score > 0.0) is has_odometry
+    assert (record.last_failure_ns > begin_ns) is has_odometry
