@@ -95,7 +95,8 @@ class OwnPoses:
         if is_old or own.gaps != _gaps(state) or self.is_guessed(state):
             return None
         noise = noise_with_factor(self._noise, adaptation.motion_factor)
-        own = own.at(state.stamp_ns, state.odometry_from_robot, noise)
+        scales = state.memory.calibration.scales
+        own = own.at(state.stamp_ns, state.odometry_from_robot, noise, scales)
         return own if own.is_known else None
 
 

@@ -14,11 +14,13 @@ from cpcbl_team.config import OdometryNoise
 from cpcbl_team.estimate import Estimate, Sums, merge, pose_difference
 from cpcbl_team.geometry import Pose2
 from cpcbl_team.miscalibration import Adaptation
-from cpcbl_team.motion import move
+from cpcbl_team.motion import NO_VARIANCE, MotionVariance, move
+from cpcbl_team.scale_errors import EXACT, ScaleErrors
 
 MOST_SIGMA_M: Final = 0.5  # a pose that is less certain, or its heading, is no reference
 MOST_SIGMA_RAD: Final = math.radians(15.0)
 LONGEST_NS: Final = 3_000_000_000  # without own sensors: then it begins anew
+CORRELATION_S: Final = 3.0  # as long
 
 
 class OwnPose(NamedTuple):
@@ -37,11 +39,18 @@ class OwnPose(NamedTuple):
         is_placed = estimate.position_sigma_m <= MOST_SIGMA_M
         return is_placed and estimate.heading_sigma_rad <= MOST_SIGMA_RAD
 
-    def at(self, stamp_ns: int, odometry_from_robot: Pose2, noise: OdometryNoise) -> "OwnPose":
+    def at(
+        self,
+        stamp_ns: int,
+        odometry_from_robot: Pose2,
+        noise: OdometryNoise,
+        scales: ScaleErrors = EXACT,
+    ) -> "OwnPose":
         """The same later, by odometry. The path is nearly an arc, for it is short."""
         way = self.odometry_from_robot.inverse() @ odometry_from_robot
         distance = math.copysign(math.hypot(way.x, way.y), way.x)
-        moved = move(self.estimate, distance, way.heading, noise)
+        extra = _of_scales(distance, way.heading, (stamp_ns - self.stamp_ns) * 1e-9, scales)
+        moved = move(self.estimate, distance, way.heading, noise, extra=extra)
         moved = moved._replace(pose=self.estimate.pose @ way)
         return self._replace(
             stamp_ns=stamp_ns, estimate=moved, odometry_from_robot=odometry_from_robot
@@ -56,3 +65,14 @@ class OwnPose(NamedTuple):
         y -= xy * dx + yy * dy + yh * dh
         h -= xh * dx + yh * dy + hh * dh
         return self._replace(estimate=merge(self.estimate, (evidence[0], (x, y, h))))
+
+
+def _of_scales(distance: float, turn: float, seconds: float, scales: ScaleErrors) -> MotionVariance:
+    """What scales that are not known add to the variances of one motion. Their errors are the same
+    in all motions. So each adds what it has in common with those of the last `CORRELATION_S`, in
+    which the robot is taken to have driven as in this one."""
+    if scales.are_exact or seconds <= 0.0:
+        return NO_VARIANCE
+    k = 1.0 + 2.0 * CORRELATION_S / seconds
+    of_distance, of_turn = scales.distance.considered, scales.turn.considered
+    return MotionVariance(k * of_distance * distance * distance, k * of_turn * turn * turn)

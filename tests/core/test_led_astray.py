@@ -20,12 +20,13 @@ from support.core import (
 
 from cpcbl_team.config import OdometrySettings, Start
 from cpcbl_team.estimate import Estimate, Information
-from cpcbl_team.geometry import Pose2
+from cpcbl_team.geometry import Pose2, step
 from cpcbl_team.inputs import Odometry
 from cpcbl_team.led_astray import misleading, with_misleading
 from cpcbl_team.miscalibration import AS_CONFIGURED
 from cpcbl_team.motion import turn_variance
 from cpcbl_team.own_pose import OwnPose
+from cpcbl_team.scale_errors import ScaleErrors
 from cpcbl_team.sender_comparisons import OWN_SENSORS
 from cpcbl_team.sender_records import QuarantineReason, SenderRecord
 from cpcbl_team.state import State
@@ -128,6 +129,23 @@ def drive(seconds: float, off_m: float = 0.0, names: Sequence[str] | None = None
         place = truth.x + off_m, truth.y
         state = ROBOT.add_fix(state, fix(*place, piece.stamp_ns, sensor_m=0.01, observer_m=0.01))
     return Driven(state, truth)
+
+
+@pytest.mark.parametrize(("distance", "turn"), [(0.05, 0.0), (0.0, 0.08)])
+def test_scales_that_are_not_known_make_it_as_uncertain_as_the_whole_way(
+    distance: float, turn: float
+) -> None:
+    """A share of all that it drives or turns in three seconds, at least."""
+    start = Pose2(0.0, 0.0, 0.0)
+    exact = OwnPose(0, Estimate(start, diagonal(0.01, 0.01)), start, AS_CONFIGURED, 0)
+    off, scales, place = exact, ScaleErrors.of_sigmas(0.1, 0.2), start
+    for i in range(1, 31):
+        place = step(place, distance, turn)
+        off = off.at(i * SECOND // 10, place, NOISE, scales)
+        exact = exact.at(i * SECOND // 10, place, NOISE)
+    least = (0.1 * 30 * distance) ** 2, (0.2 * 30 * turn) ** 2
+    for i, added in zip((0, 5), least, strict=True):
+        assert off.estimate.covariance[i] - exact.estimate.covariance[i] >= added
 
 
 def test_help_does_not_move_the_pose_by_own_sensors() -> None:
