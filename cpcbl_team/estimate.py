@@ -99,6 +99,11 @@ def dot(a: Row, b: Row) -> float:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
+def row_sum(a: Row, b: Row, k: float = 1.0) -> Row:
+    """a + k b."""
+    return a[0] + k * b[0], a[1] + k * b[1], a[2] + k * b[2]
+
+
 def outer(a: Row) -> Covariance3:
     """a a^T: the covariance of an error that is a times an error of variance 1."""
     x, y, h = a

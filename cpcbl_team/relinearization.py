@@ -14,7 +14,7 @@ from cpcbl_team.arcs import Arc, square_root
 from cpcbl_team.common_error_filter import CommonErrorFilter
 from cpcbl_team.config import LocalizationSettings, LocalizerSettings
 from cpcbl_team.constraints import TELLS_NOTHING, Constraint, curved_variance
-from cpcbl_team.estimate import POSE, ZERO3, Estimate, Row, dot
+from cpcbl_team.estimate import POSE, ZERO3, Estimate, Row, dot, row_sum
 from cpcbl_team.geometry import Pose2, wrap_angle
 from cpcbl_team.measurements import Measurement, constraints_of
 from cpcbl_team.state import State, with_common_errors
@@ -62,7 +62,7 @@ class Linearization(NamedTuple):
         measurements: E[(e^T M e / 2)^2] = (tr(M)^2 + 2 |M|^2) / 4 of a normal e, with second
         differences M along the columns of a square root of the covariance."""
         a, b, c = square_root(self.fit.covariance)
-        pairs = _sum(a, b), _sum(a, c), _sum(b, c)
+        pairs = row_sum(a, b), row_sum(a, c), row_sum(b, c)
         along = [self._second_differences(here, by, m, rules) for by in (a, b, c, *pairs)]
         squares = []
         for aa, bb, cc, ab, ac, bc in zip(*along, strict=True):
@@ -82,10 +82,6 @@ class Linearization(NamedTuple):
         if not len(before) == len(here) == len(after):
             return [TELLS_NOTHING] * len(here)
         return [_second_difference(*beside) for beside in zip(before, here, after, strict=True)]
-
-
-def _sum(a: Row, b: Row) -> Row:
-    return a[0] + b[0], a[1] + b[1], a[2] + b[2]
 
 
 def _second_difference(before: Constraint, here: Constraint, after: Constraint) -> float:

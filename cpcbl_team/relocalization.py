@@ -28,6 +28,7 @@ from cpcbl_team.estimate import (
     merge,
     offset_pose,
     outer,
+    row_sum,
 )
 from cpcbl_team.fusion import chi_square_bound
 from cpcbl_team.geometry import Pose2, wrap_angle
@@ -359,7 +360,7 @@ def _profile(
     origin: Pose2, goal: float, axis: Row, used: list[PropagatedEvidence], noise: OdometryNoise
 ) -> tuple[float, Row]:
     """(chi-square, offset) of the best pose among those that are so far along an axis."""
-    offset, least = _sum((0.0, 0.0, 0.0), axis, goal), math.nan
+    offset, least = row_sum((0.0, 0.0, 0.0), axis, goal), math.nan
     for _ in range(3):
         covariance, step, least = _filtered(offset_pose(origin, offset, POSE), used, noise)
         towards = covariance.times(axis)
@@ -368,12 +369,8 @@ def _profile(
             return math.nan, offset
         k = -dot(axis, step) / along
         least += k * k * along
-        offset = _sum(_sum(offset, step), towards, k)
+        offset = row_sum(row_sum(offset, step), towards, k)
     return least, offset
-
-
-def _sum(a: Row, b: Row, k: float = 1.0) -> Row:
-    return a[0] + k * b[0], a[1] + k * b[1], a[2] + k * b[2]
 
 
 def _weakest_axis(covariance: Covariance3) -> tuple[float, Row]:
@@ -381,7 +378,7 @@ def _weakest_axis(covariance: Covariance3) -> tuple[float, Row]:
     axis = 1.0, 0.7, 0.4
     for _ in range(30):
         towards = covariance.times(axis)
-        axis = _sum((0.0, 0.0, 0.0), towards, 1.0 / math.sqrt(dot(towards, towards)))
+        axis = row_sum((0.0, 0.0, 0.0), towards, 1.0 / math.sqrt(dot(towards, towards)))
     return dot(axis, covariance.times(axis)), axis
 
 

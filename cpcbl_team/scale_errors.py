@@ -26,6 +26,7 @@ from cpcbl_team.estimate import (
     dot,
     outer,
     pose_difference,
+    row_sum,
 )
 from cpcbl_team.parameters import NO_COVARIANCE
 
@@ -99,7 +100,7 @@ class Scale(NamedTuple):
         """
         share = self.variance / max(self.considered, SMALLEST_VARIANCE)
         of_pose = _times(inverse.times(before.covariance), share)
-        taken = share * dot(of_pose, _plus(before.covariance, self.covariance, -1.0))
+        taken = share * dot(of_pose, row_sum(before.covariance, self.covariance, -1.0))
         change = _bounded_change(dot(of_pose, news), taken)
         variance = max(self.variance - max(taken, 0.0), LEAST_SHARE * self.first)
         return self._replace(variance=variance, error=self.error + change)
@@ -120,10 +121,10 @@ class Scale(NamedTuple):
         by `by_share`; and what that has added to the covariance of the pose."""
         led = _led(self.covariance, dx, dy)
         # X g^T + g X^T, of which half of g B g^T is in each
-        added = _symmetric(_plus(led, by_share, 0.5 * self.considered), by_share)
+        added = _symmetric(row_sum(led, by_share, 0.5 * self.considered), by_share)
         known = self._replace(
-            offset=_plus(_led(self.offset, dx, dy), by_share, self.error),
-            covariance=_plus(led, by_share, self.considered),
+            offset=row_sum(_led(self.offset, dx, dy), by_share, self.error),
+            covariance=row_sum(led, by_share, self.considered),
         )
         return known, added
 
@@ -168,7 +169,7 @@ class ScaleErrors(NamedTuple):
     @property
     def offset(self) -> Row:
         """What errors of the scales that are not corrected have moved the pose by."""
-        return _plus(self.distance.offset, self.turn.offset)
+        return row_sum(self.distance.offset, self.turn.offset)
 
     def at_new_pose(self) -> "ScaleErrors":
         """At a pose that does not follow from the odometry until now."""
@@ -191,8 +192,8 @@ class ScaleErrors(NamedTuple):
         known = ScaleErrors(distance, turn, now)
         if estimates and covariance.hh <= MOST_HEADING_VARIANCE:
             # What is known already to be wrong with the pose was expected
-            expected = _plus(self.offset, known.offset, -1.0)
-            news = _plus(pose_difference(before.pose, now.pose), expected, -1.0)
+            expected = row_sum(self.offset, known.offset, -1.0)
+            news = row_sum(pose_difference(before.pose, now.pose), expected, -1.0)
             distance = distance.with_correction(self.distance, inverse, news)
             turn = turn.with_correction(self.turn, inverse, news)
             known = ScaleErrors(distance, turn, now)
@@ -205,7 +206,7 @@ class ScaleErrors(NamedTuple):
         turn, by_turn = self.turn.corrected()
         if distance is self.distance and turn is self.turn:
             return self, NO_COVARIANCE
-        return ScaleErrors(distance, turn, self.estimate), _plus(by_distance, by_turn)
+        return ScaleErrors(distance, turn, self.estimate), row_sum(by_distance, by_turn)
 
     def after_motion(
         self, before: Estimate, distance: float, turn: float
@@ -223,7 +224,7 @@ class ScaleErrors(NamedTuple):
         """By how much (m, m, rad) shares that were too short by this have moved the pose. The
         scales are only considered."""
         known = self.after_updates(now, estimates=False)
-        return _plus(known.distance.pose_offset(distance), known.turn.pose_offset(turn))
+        return row_sum(known.distance.pose_offset(distance), known.turn.pose_offset(turn))
 
     def with_considered(self, distance: float, turn: float) -> "ScaleErrors":
         """With other variances in the covariance of the pose, of which somebody else knows."""
@@ -296,11 +297,6 @@ def _led(row: Row, dx: float, dy: float) -> Row:
     """F row, with F the Jacobian of a motion by (dx, dy)."""
     x, y, heading = row
     return x - dy * heading, y + dx * heading, heading
-
-
-def _plus(row: Row, other: Row, k: float = 1.0) -> Row:
-    """row + k other."""
-    return row[0] + k * other[0], row[1] + k * other[1], row[2] + k * other[2]
 
 
 def _times(row: Row, k: float) -> Row:
