@@ -32,6 +32,7 @@ from cpcbl_team.moved_landmarks import (
     with_move,
 )
 from cpcbl_team.new_landmarks import relative_place
+from cpcbl_team.own_pose import OwnPose
 from cpcbl_team.parameters import Sensitivity, sensitivity_dot
 from cpcbl_team.places import EXACT, place_covariance
 from cpcbl_team.sensors import sighting_sigmas
@@ -45,6 +46,10 @@ from cpcbl_team.state import (
 )
 
 LATEST, LEAST_ACCEPTED = 8, 3
+DEPENDENT_FRAMES = 4.0
+"""By which the variances of a camera's readings grow for the pose by own sensors: errors of tilt
+and edges are nearly the same in the next frame, and what is to judge teammates must not be too sure
+of itself. With it that pose is consistent even where most of the error of each range stays."""
 MOST_SIGMAS = 3.0  # of a bias of bearings: what is more is another error, such as wrong ranges
 _ZERO_ROW: Row = (0.0, 0.0, 0.0)
 _UNAFFECTED: tuple[Sensitivity, Sensitivity] = ((), ())
@@ -96,7 +101,8 @@ def common_error_filter(
     if is_exact and field.is_exact:
         return None
     learns = not is_exact and (camera is None or camera.self_calibration)
-    return CommonErrorFilter(settings, field, prior, learns)
+    factor = 1.0 if camera is None else DEPENDENT_FRAMES
+    return CommonErrorFilter(settings, field, prior, learns, factor)
 
 
 def common_errors_of(state: State) -> CommonErrors:
@@ -104,6 +110,16 @@ def common_errors_of(state: State) -> CommonErrors:
     common = state.common_errors
     assert common is not None
     return common
+
+
+def _readings_of(accepted: Sequence[GatedObject]) -> list[Reading]:
+    """What the objects of the map say, not those of teammates."""
+    return [
+        Reading(c.row, sensitivity, c.residual, c.sigma * c.sigma)
+        for found in accepted
+        if not found.measurement.sender
+        for c, sensitivity in zip(found.constraints, found.sensitivities, strict=True)
+    ]
 
 
 class CommonErrorFilter:
@@ -116,12 +132,14 @@ class CommonErrorFilter:
         field: Field,
         prior: CommonErrors,
         learns_camera: bool,
+        own_factor: float = 1.0,
     ) -> None:
         """`prior`: what the settings say of the errors of the sensor; `learns_camera`: whether
-        these are estimated, not only considered."""
+        these are estimated, not only considered. `own_factor`: by which the variances of readings
+        grow for the pose by own sensors."""
         self._field, self._sensor, self._noise = field, settings.sensor, settings.odometry
         self._splits = settings.collaboration.fusion == "split-ci"
-        self.prior, self._learns_camera = prior, learns_camera
+        self.prior, self._learns_camera, self._own_factor = prior, learns_camera, own_factor
 
     def started(self, state: State) -> State:
         """The state in which nothing but the settings and the map is known."""
@@ -216,17 +234,11 @@ class CommonErrorFilter:
         objects of the map and then, one by one, the teammates."""
         prior, common = state.estimate, common_errors_of(state)
         before = common.values
-        readings = [
-            Reading(c.row, sensitivity, c.residual, c.sigma * c.sigma)
-            for found in accepted
-            if not found.measurement.sender
-            for c, sensitivity in zip(found.constraints, found.sensitivities, strict=True)
-        ]
+        readings = _readings_of(accepted)
         estimate = prior
         if readings:
             estimate, common = updated(prior, common, readings, self._learns_camera)
-            if common.is_of_bearings:
-                common = common.with_bias_below(MOST_SIGMAS * self.prior.camera_sigmas.yaw_rad)
+            common = self._bounded(common)
         for found in accepted:
             m = found.measurement
             if not m.sender:
@@ -250,6 +262,47 @@ class CommonErrorFilter:
         if common.found:
             return self._watch_found(state, accepted, estimate, common)
         return with_common_errors(state, common), estimate
+
+    def _bounded(self, common: CommonErrors) -> CommonErrors:
+        if not common.is_of_bearings:
+            return common
+        return common.with_bias_below(MOST_SIGMAS * self.prior.camera_sigmas.yaw_rad)
+
+    def own_pose_for(self, own: OwnPose, state: State) -> OwnPose | None:
+        """The pose by own sensors with the same objects as the state, in the same order: what is
+        known of those that the robot has seen since is what the map says. None if the places that
+        the robot has found are others now."""
+        ours, common = own.common, common_errors_of(state)
+        if ours is None or ours.found != common.found:
+            return None
+        if ours.objects == common.objects:
+            return own
+        if any(common.objects.get(name) != number for name, number in ours.objects.items()):
+            return None
+        for name, _ in sorted(common.objects.items(), key=lambda item: item[1]):
+            if name not in ours.objects:
+                ours = ours.with_object(name, place_covariance(self._field, name))
+        return own._replace(common=ours)
+
+    def own_pose_after(
+        self, own: OwnPose, state: State, accepted: Sequence[GatedObject]
+    ) -> OwnPose:
+        """The pose by own sensors after the objects of the map in a frame."""
+        k = self._own_factor
+        readings = [r._replace(variance=k * r.variance) for r in _readings_of(accepted)]
+        return self._own_pose_with(own, state, readings)
+
+    def own_pose_observed(self, own: OwnPose, state: State, observation: Observation) -> OwnPose:
+        """The same after a reading of the position sensor about the estimate."""
+        parts = observation.noise(), _UNAFFECTED
+        return self._own_pose_with(own, state, independent_readings(observation, *parts))
+
+    def _own_pose_with(self, own: OwnPose, state: State, readings: Sequence[Reading]) -> OwnPose:
+        if not readings:
+            return own
+        known = common_errors_of(state)
+        own = own.with_readings(state.estimate.pose, known, readings, self._learns_camera)
+        return own._replace(common=None if own.common is None else self._bounded(own.common))
 
     def _watch_found(
         self,

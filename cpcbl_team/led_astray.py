@@ -8,17 +8,21 @@ last reports of senders, then these led the estimate astray: they are quarantine
 goes on from its own pose.
 """
 
+from collections.abc import Sequence
 from typing import Final
 
 from msgspec.structs import replace
 
+from cpcbl_team.common_error_filter import CommonErrorFilter, common_errors_of
 from cpcbl_team.config import OdometrySettings
 from cpcbl_team.estimate import Estimate, Sums, pose_difference
 from cpcbl_team.fusion import Observation, mark_shared
 from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.mean_offsets import CONFLICT, CONFLICT_OF_MOST, FAST_COMMON_M
+from cpcbl_team.measurements import GatedObject
 from cpcbl_team.miscalibration import noise_with_factor
 from cpcbl_team.own_pose import LONGEST_NS, OwnPose
+from cpcbl_team.parameters import sensitivity_dot
 from cpcbl_team.recovery_evidence import without_senders
 from cpcbl_team.sender_comparisons import OWN_SENSORS, RECENT_NS, SenderRecords
 from cpcbl_team.sender_records import (
@@ -28,7 +32,13 @@ from cpcbl_team.sender_records import (
     quarantined,
     released,
 )
-from cpcbl_team.state import State, at_new_pose, with_memory, with_teammates
+from cpcbl_team.state import (
+    State,
+    at_new_pose,
+    with_common_errors,
+    with_memory,
+    with_teammates,
+)
 from cpcbl_team.trust import BY_COMPARISON, reset_scores
 
 GUESSED_NS: Final = 100_000_000  # odometry that is missing for longer does not only come late
@@ -37,32 +47,65 @@ GUESSED_NS: Final = 100_000_000  # odometry that is missing for longer does not 
 class OwnPoses:
     """The pose by own sensors of one robot, and what follows where help led it astray."""
 
-    def __init__(self, odometry: OdometrySettings) -> None:
-        self._noise = odometry
+    def __init__(
+        self, odometry: OdometrySettings, common: CommonErrorFilter | None, gate: float
+    ) -> None:
+        """`common`: the errors that own sightings have in common. `gate`: the chi-square bound of
+        two constraints."""
+        self._noise, self._common, self._gate = odometry, common, gate
 
-    def after_frame(self, state: State, sums: Sums) -> State:
-        """The state after a frame: what own sensors say of the offset of the estimate. The pose
-        begins as the estimate when help comes first, and after a gap of the odometry."""
-        own, memory = self._present(state), state.memory
+    def after_frame(self, state: State, sums: Sums, accepted: Sequence[GatedObject]) -> State:
+        """The state after a frame: what own sensors say of the offset of the estimate, as sums, or
+        where these have errors in common as the `accepted` objects. The pose begins as the estimate
+        when help comes first, and after a gap of the odometry."""
+        own = self._present(state)
         if own is None:
-            adaptation, estimate = memory.calibration.adaptation, mark_shared(state.estimate)
-            own = OwnPose(
-                state.stamp_ns, estimate, state.odometry_from_robot, adaptation, _gaps(state)
-            )
+            own = self._begun(state)
+        elif self._common is not None:
+            own = self._common.own_pose_after(own, state, accepted)
         else:
             own = own.with_evidence(state.estimate.pose, sums)
-        return with_teammates(state, memory.teammates._replace(own=own))
+        return with_own_pose(state, own)
+
+    def after_position(self, state: State, position: Observation, is_accepted: bool) -> State:
+        """The state after a reading of the position sensor about the estimate, which has accepted
+        it or not. Whether the pose by own sensors accepts it is another question: help may have led
+        the estimate away."""
+        own = self._present(state)
+        if own is None:
+            return with_own_pose(state, self._begun(state)) if is_accepted else state
+        if _nis(own, state, position) > self._gate:
+            return state
+        if self._common is not None:
+            own = self._common.own_pose_observed(own, state, position)
+        else:
+            own = own.with_evidence(state.estimate.pose, position.information())
+        return with_own_pose(state, own)
 
     def nis(self, state: State, observation: Observation) -> float:
         """How far a report contradicts the pose by own sensors, scaled to two degrees of freedom;
         0 if there is none."""
         own = self._present(state)
-        if own is None:
+        return 0.0 if own is None else _nis(own, state, observation)
+
+    def nis_of_sighting(self, state: State, found: GatedObject) -> float:
+        """The same of a teammate that the robot saw where that says it is, or of a landmark that
+        stands where it says. What the estimate knows of the errors that own sightings have in
+        common is replaced by what own sensors say of them."""
+        own, observation, known = self._present(state), found.observation, state.common_errors
+        if own is None or observation is None:
             return 0.0
-        offset = pose_difference(state.estimate.pose, own.estimate.pose)
-        about = observation.shifted(*offset)
-        nis = about.normalized_innovation_squared(own.estimate.covariance)
-        return 2.0 * nis / len(observation.rows)
+        if own.common is not None and known is not None:
+            rows, sensitivities = observation.rows, found.sensitivities
+            values = tuple(b - a for a, b in zip(known.values, own.common.values, strict=True))
+            pairs = zip(observation.residuals, sensitivities, strict=True)
+            added = own.common.innovation(rows, sensitivities)
+            replaced = known.innovation(rows, sensitivities)
+            observation = observation._replace(
+                residuals=tuple(e - sensitivity_dot(c, values) for e, c in pairs),
+                dependent=observation.dependent + replaced.scaled(-1.0) + added,
+            )
+        return _nis(own, state, observation)
 
     def is_guessed(self, state: State) -> bool:
         """Whether the robot follows a guess, as before, because its odometry is missing. What
@@ -77,6 +120,8 @@ class OwnPoses:
         own = teammates.own
         if own is None or own.stamp_ns != now_ns or state.lost:
             return state
+        if own.common is not None and own.common.found != common_errors_of(state).found:
+            return state  # a landmark that the robot had found stands elsewhere now
         names = misleading(teammates.senders, state.estimate, own.estimate, now_ns)
         if not names:
             return state
@@ -84,6 +129,8 @@ class OwnPoses:
         state = with_memory(state, state.memory.counted("outvoted")._replace(recovery=recovery))
         senders = with_misleading(teammates.senders, names, now_ns)
         state = at_new_pose(state, own.estimate)
+        if own.common is not None:
+            state = with_common_errors(state, own.common)
         return with_teammates(state, teammates._replace(senders=senders, own=own))
 
     def _present(self, state: State) -> OwnPose | None:
@@ -97,7 +144,15 @@ class OwnPoses:
         noise = noise_with_factor(self._noise, adaptation.motion_factor)
         scales = state.memory.calibration.scales
         own = own.at(state.stamp_ns, state.odometry_from_robot, noise, scales)
-        return own if own.is_known else None
+        if not own.is_known:
+            return None
+        return own if self._common is None else self._common.own_pose_for(own, state)
+
+    def _begun(self, state: State) -> OwnPose:
+        calibration, estimate = state.memory.calibration, mark_shared(state.estimate)
+        place, gaps = state.odometry_from_robot, _gaps(state)
+        of_settings = calibration.adaptation, gaps, calibration.common
+        return OwnPose(state.stamp_ns, estimate, place, *of_settings)
 
 
 def misleading(
@@ -145,6 +200,19 @@ def with_misleading(senders: SenderRecords, names: frozenset[str], now_ns: int) 
         elif is_recent and record.own_nis <= CONTRADICTING_NIS:
             found[name] = released(found[name], now_ns)
     return found
+
+
+def with_own_pose(state: State, own: OwnPose) -> State:
+    """The state with this pose by own sensors."""
+    return with_teammates(state, state.memory.teammates._replace(own=own))
+
+
+def _nis(own: OwnPose, state: State, observation: Observation) -> float:
+    """Of an observation about the estimate, scaled to two degrees of freedom."""
+    offset = pose_difference(state.estimate.pose, own.estimate.pose)
+    about = observation.shifted(*offset)
+    nis = about.normalized_innovation_squared(own.estimate.covariance)
+    return 2.0 * nis / len(observation.rows)
 
 
 def _gaps(state: State) -> int:

@@ -101,7 +101,8 @@ class Localizer:
         has_common = self._common is not None or not field.is_exact
         self._stationary = StationaryCheck(settings, self._variant.reduce, has_common)
         self.recovery = Recovery(settings, field, self._landmarks, self._variant.reduce)
-        self.screen = TeammateScreen(settings, gates, self._variant.is_probabilistic, team)
+        is_probabilistic = self._variant.is_probabilistic
+        self.screen = TeammateScreen(settings, gates, is_probabilistic, team, self._common)
         self.landmark_beliefs = LandmarkBeliefs(settings, field, self._common, self.screen)
 
     def cycle(self, state: State, frame: Sightings) -> State:
@@ -311,9 +312,9 @@ class Localizer:
             observation = self.screen.with_caution(state, observation)
             position = observation.of_position(prior.pose)
         if nis > self._gates[1]:
-            if self.screen.has_no_vote(state, observation.sender):  # whether the robot is lost
+            if self.screen.has_no_vote(state, observation):  # whether the robot is lost
                 return self.recovery.check(state.counted("distrusted"))
-            return self.recovery.check(self._with_update(state, prior, None, {}, 1))
+            return self._checked(self._with_update(state, prior, None, {}, 1), observation)
         by_teammate = observation.observer is not None
         if self._common is not None:
             state, estimate = self._common.observed(state, prior, position, by_teammate)
@@ -342,7 +343,15 @@ class Localizer:
                 state = state.counted("heading_gated")._replace(updates=updates)
                 used, rejected = {}, 1
         estimate = self._variant.reduce(estimate)
-        return self.recovery.check(self._with_update(state, estimate, None, used, rejected))
+        state = self._with_update(state, estimate, None, used, rejected)
+        return self._checked(state, observation)
+
+    def _checked(self, state: State, observation: PoseObservation) -> State:
+        """The state after an observation was used, or was not: at the robot's own pose if help led
+        it away from there, as far as the robot's position sensor tells."""
+        if observation.observer is None:
+            state = self.screen.own.without_misleading(state)
+        return self.recovery.check(state)
 
     def _record_observation(self, state: State, observation: PoseObservation) -> State:
         """The state that keeps this observation as evidence for recovery, unless its sender is in

@@ -5,16 +5,23 @@ was about another estimate then, and along an axis that they do not measure at p
 theirs would contradict. So this pose is the reference that no help can move: that of the estimate
 when the first help came, after the odometry and the own sensors since then. Along an axis that
 these do not measure it becomes uncertain, as it should.
+
+Errors that the sightings have in common, as those of a camera, are states beside this pose too,
+apart from those beside the estimate: what is known of them there may come from help.
 """
 
 import math
+from collections.abc import Iterable
 from typing import Final, NamedTuple
 
+from cpcbl_team.augmented_update import Reading, updated
+from cpcbl_team.common_errors import CommonErrors
 from cpcbl_team.config import OdometryNoise
-from cpcbl_team.estimate import Estimate, Sums, merge, pose_difference
+from cpcbl_team.estimate import Estimate, Sums, dot, merge, pose_difference
 from cpcbl_team.geometry import Pose2
 from cpcbl_team.miscalibration import Adaptation
 from cpcbl_team.motion import NO_VARIANCE, MotionVariance, move
+from cpcbl_team.parameters import sensitivity_dot
 from cpcbl_team.scale_errors import EXACT, ScaleErrors
 
 MOST_SIGMA_M: Final = 0.5  # a pose that is less certain, or its heading, is no reference
@@ -31,6 +38,9 @@ class OwnPose(NamedTuple):
     odometry_from_robot: Pose2  # dead reckoning at that time
     adaptation: Adaptation  # the settings with which it was found
     gaps: int  # of the odometry until then
+    common: CommonErrors | None = (
+        None  # what own sensors say of the errors that they have in common
+    )
 
     @property
     def is_known(self) -> bool:
@@ -49,11 +59,19 @@ class OwnPose(NamedTuple):
         """The same later, by odometry. The path is nearly an arc, for it is short."""
         way = self.odometry_from_robot.inverse() @ odometry_from_robot
         distance = math.copysign(math.hypot(way.x, way.y), way.x)
-        extra = _of_scales(distance, way.heading, (stamp_ns - self.stamp_ns) * 1e-9, scales)
+        seconds = (stamp_ns - self.stamp_ns) * 1e-9
+        extra = _of_scales(distance, way.heading, seconds, scales)
         moved = move(self.estimate, distance, way.heading, noise, extra=extra)
         moved = moved._replace(pose=self.estimate.pose @ way)
+        common = self.common
+        if common is not None:
+            common = common.after_motion(self.estimate.pose.heading, distance, way.heading)
+            common = common.after_time(seconds)
         return self._replace(
-            stamp_ns=stamp_ns, estimate=moved, odometry_from_robot=odometry_from_robot
+            stamp_ns=stamp_ns,
+            estimate=moved,
+            odometry_from_robot=odometry_from_robot,
+            common=common,
         )
 
     def with_evidence(self, about: Pose2, evidence: Sums) -> "OwnPose":
@@ -65,6 +83,24 @@ class OwnPose(NamedTuple):
         y -= xy * dx + yy * dy + yh * dh
         h -= xh * dx + yh * dy + hh * dh
         return self._replace(estimate=merge(self.estimate, (evidence[0], (x, y, h))))
+
+    def with_readings(
+        self, about: Pose2, known: CommonErrors, readings: Iterable[Reading], with_camera: bool
+    ) -> "OwnPose":
+        """With readings of own sensors, which were linearized at the pose `about` and corrected by
+        what is `known` of the errors that they have in common. `with_camera`: as in `updated`."""
+        common = self.common
+        assert common is not None
+        offset = pose_difference(about, self.estimate.pose)
+        values = tuple(b - a for a, b in zip(known.values, common.values, strict=True))
+        of_own = [
+            r._replace(
+                residual=r.residual - dot(r.row, offset) - sensitivity_dot(r.sensitivity, values)
+            )
+            for r in readings
+        ]
+        estimate, common = updated(self.estimate, common, of_own, with_camera)
+        return self._replace(estimate=estimate, common=common)
 
 
 def _of_scales(distance: float, turn: float, seconds: float, scales: ScaleErrors) -> MotionVariance:

@@ -11,6 +11,7 @@ from itertools import product
 from msgspec.structs import replace
 
 from cpcbl_team import trust
+from cpcbl_team.common_error_filter import CommonErrorFilter
 from cpcbl_team.config import LocalizationSettings
 from cpcbl_team.estimate import Covariance3, Information, Sums
 from cpcbl_team.fixes import PoseObservation
@@ -62,16 +63,18 @@ class TeammateScreen:
         gates: tuple[float, float],
         is_probabilistic: bool,
         teammates: Collection[str] | None = None,
+        common: CommonErrorFilter | None = None,
     ) -> None:
         """`gates`: chi-square bounds of one and of two degrees of freedom. Without a covariance
         there is no NIS, and nothing is screened. `teammates`: the robots of the team; all others
-        are guests (None: there are no guests)."""
+        are guests (None: there are no guests). `common`: the errors that own sightings have in
+        common."""
         self._teammates = teammates
         self._collaboration, self._rules = settings.collaboration, settings.collaboration.trust
         self._localizer_rules = settings.localizer
         self._gates = gates
         o = settings.odometry
-        self.own = OwnPoses(o)
+        self.own = OwnPoses(o, common, gates[1])
         self._odometry_errors = o.distance_sigma_m_per_sqrt_m**2, o.distance_scale_sigma
         self.is_active = self._rules.enabled and is_probabilistic
 
@@ -99,8 +102,8 @@ class TeammateScreen:
             sums = combine(Information.of(landmarks.evidence.sums()), gated.accepted)
             own = _own_offset(state, sums, gated.accepted)
             state = self._with_own_sensors(state, accepted, rejected, own)
-            if accepted and state.common_errors is None:
-                state = self.own.after_frame(state, sums)
+            if accepted:
+                state = self.own.after_frame(state, sums, gated.accepted)
         state, distrusted = self._screen_reports(state, gated)
         if distrusted:
             gated = GatedObjects(*(_without(objects, distrusted) for objects in gated))
@@ -130,7 +133,7 @@ class TeammateScreen:
                     evidence = _with_camera(state, first.measurement, of_it)
             report = TeammateReport(now, of_two, evidence=evidence, is_guest=self._is_guest(sender))
             if first.observation:
-                report = report._replace(own_nis=self.own.nis(state, first.observation))
+                report = report._replace(own_nis=self.own.nis_of_sighting(state, first))
             state, is_trusted = self._assess(state, sender, report, first.measurement.source)
             if not is_trusted:
                 distrusted.add(sender)
@@ -188,10 +191,11 @@ class TeammateScreen:
             )
         return dependent + Covariance2(more, 0.0, more) if more else dependent
 
-    def has_no_vote(self, state: State, sender: str) -> bool:
-        """Whether this is a guest whose rejected reports do not count towards being lost. Otherwise
-        several guests beside robots of the team could make it lost whenever they like."""
-        if not self.is_active or not self._is_guest(sender):
+    def has_no_vote(self, state: State, observation: PoseObservation) -> bool:
+        """Whether this is of a guest whose rejected reports do not count towards being lost.
+        Otherwise several guests beside robots of the team could make it lost whenever they like."""
+        is_own, sender = observation.observer is None, observation.sender
+        if is_own or not self.is_active or not self._is_guest(sender):
             return False
         return sender not in voters(state.memory.teammates.senders, state.stamp_ns)
 
@@ -221,6 +225,7 @@ class TeammateScreen:
                 sums = position.information(position.noise(0.0))
                 own = _evidence_at(state, sums)
                 state = self._with_own_sensors(state, is_accepted, not is_accepted, own)
+                state = self.own.after_position(state, position, is_accepted)
             return state, True
         heading, of_heading = observation.of_heading(state.estimate.pose), None
         if heading is not None:  # three degrees of freedom, scaled to two
