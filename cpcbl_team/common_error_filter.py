@@ -46,7 +46,7 @@ from cpcbl_team.state import (
 )
 
 LATEST, LEAST_ACCEPTED = 8, 3
-DEPENDENT_FRAMES = 4.0
+DEPENDENT_FRAMES = 2.0
 """By which the variances of a camera's readings grow for the pose by own sensors: errors of tilt
 and edges are nearly the same in the next frame, and what is to judge teammates must not be too sure
 of itself. With it that pose is consistent even where most of the error of each range stays."""
