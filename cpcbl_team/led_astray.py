@@ -60,7 +60,7 @@ class OwnPoses:
         when help comes first, and after a gap of the odometry."""
         own = self._present(state)
         if own is None:
-            own = self._begun(state)
+            own = self._new_own_pose(state)
         elif self._common is not None:
             own = self._common.own_pose_after(own, state, accepted)
         else:
@@ -73,7 +73,7 @@ class OwnPoses:
         the estimate away."""
         own = self._present(state)
         if own is None:
-            return with_own_pose(state, self._begun(state)) if is_accepted else state
+            return with_own_pose(state, self._new_own_pose(state)) if is_accepted else state
         if _nis(own, state, position) > self._gate:
             return state
         if self._common is not None:
@@ -148,7 +148,7 @@ class OwnPoses:
             return None
         return own if self._common is None else self._common.own_pose_for(own, state)
 
-    def _begun(self, state: State) -> OwnPose:
+    def _new_own_pose(self, state: State) -> OwnPose:
         calibration, estimate = state.memory.calibration, mark_shared(state.estimate)
         place, gaps = state.odometry_from_robot, _gaps(state)
         of_settings = calibration.adaptation, gaps, calibration.common

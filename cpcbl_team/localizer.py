@@ -314,7 +314,8 @@ class Localizer:
         if nis > self._gates[1]:
             if self.screen.has_no_vote(state, observation):  # whether the robot is lost
                 return self.recovery.check(state.counted("distrusted"))
-            return self._checked(self._with_update(state, prior, None, {}, 1), observation)
+            state = self._with_update(state, prior, None, {}, 1)
+            return self._after_observation(state, observation)
         by_teammate = observation.observer is not None
         if self._common is not None:
             state, estimate = self._common.observed(state, prior, position, by_teammate)
@@ -344,9 +345,9 @@ class Localizer:
                 used, rejected = {}, 1
         estimate = self._variant.reduce(estimate)
         state = self._with_update(state, estimate, None, used, rejected)
-        return self._checked(state, observation)
+        return self._after_observation(state, observation)
 
-    def _checked(self, state: State, observation: PoseObservation) -> State:
+    def _after_observation(self, state: State, observation: PoseObservation) -> State:
         """The state after an observation was used, or was not: at the robot's own pose if help led
         it away from there, as far as the robot's position sensor tells."""
         if observation.observer is None:
