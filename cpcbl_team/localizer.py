@@ -117,7 +117,7 @@ class Localizer:
             if state.lost:
                 state = self._calibration.after_rejected(state)
             return self.recovery.check(state)
-        gated = _NO_OBJECTS
+        gated, before = _NO_OBJECTS, state.estimate
         if others:
             state, gated = self._gate.constrain(state, others, scope)  # 3. constraints
         if self.screen.is_due(state, gated):  # beyond the paper: trust
@@ -125,6 +125,8 @@ class Localizer:
         prior = state.estimate
         if self._common is None:
             estimate = self.correct(prior, landmarks, gated, scope)
+            if prior is before:  # else it is about the best pose on its arc
+                estimate = self._relinearization.after_frame(prior, estimate)
         else:
             state, estimate = self._common.correct(state, gated.accepted)
         state = self._with_frame(state, estimate, landmarks, gated, scope)
