@@ -95,6 +95,28 @@ def with_arc_width(estimate: Estimate) -> Estimate:
     return Estimate(estimate.pose, estimate.covariance.plus(added), shared)
 
 
+def lever_change(dx: float, dy: float) -> Matrix3:
+    """The matrix that expresses an error about a pose as one about a pose that is (dx, dy) from
+    there: an error of the heading turns the position about the origin, and so by this much more."""
+    return 1.0, 0.0, -dy, 0.0, 1.0, dx, 0.0, 0.0, 1.0
+
+
+def about_own_pose(estimate: Estimate, linearized_at: Pose2) -> Estimate:
+    """The estimate with a covariance about its own pose, not about the one at which its
+    measurements were linearized.
+
+    A turn about the only landmark changes no reading. What its error does to the position depends
+    on where the robot is. So when an update moves the estimate, the covariance has to follow. Else
+    updates would make certainty of that turn, of which nothing is measured (Huang, Mourikis &
+    Roumeliotis, IJRR 29, 2010). This is the right-invariant error of Barrau & Bonnabel (2017), to
+    first order.
+    """
+    pose, covariance, shared = estimate
+    change = lever_change(pose.x - linearized_at.x, pose.y - linearized_at.y)
+    shared = shared if shared is ZERO3 else shared.transformed(change)
+    return Estimate(pose, covariance.transformed(change), shared)
+
+
 def square_root(covariance: Covariance3) -> tuple[Row, Row, Row]:
     """The columns of a square root of a covariance: the sum of their outer products is the
     covariance (the Cholesky decomposition)."""

@@ -4,6 +4,7 @@ import math
 from collections.abc import Callable, Iterable
 from typing import Final, NamedTuple
 
+from cpcbl_team.arcs import lever_change
 from cpcbl_team.common_errors import CAMERA, CommonErrors
 from cpcbl_team.estimate import (
     POSE,
@@ -127,8 +128,7 @@ class AugmentedUpdate:
             levers[i], levers[i + 1] = -self._changes[i + 1], self._changes[i]
         _, _, _, xh, yh, hh = self.covariance
         parameters = self._parameters.sheared((-dy, dx), tuple(levers), (xh, yh, hh))
-        moved = 1.0, 0.0, -dy, 0.0, 1.0, dx, 0.0, 0.0, 1.0
-        return self.covariance.transformed(moved), parameters
+        return self.covariance.transformed(lever_change(dx, dy)), parameters
 
 
 def estimated_of(common: CommonErrors, with_camera: bool) -> tuple[bool, ...]:

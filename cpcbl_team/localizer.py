@@ -85,10 +85,9 @@ class Localizer:
         contain the errors that all of them have in common."""
         self.settings, self.field, rules = settings, field, settings.localizer
         gates = chi_square_bounds(rules.gate_probability)
-        self._rules, self._gates = rules, gates
+        self._rules, self._gates, self._window = rules, gates, rules.lost_window
         self._has_map = field.has_surveyed
         self._minimum_interval_ns = rules.minimum_interval_s * 1e9
-        self._window = rules.lost_window
         self._belief_age_ns = int(settings.collaboration.max_age_s * 1e9)
         self._timers = ObjectTimers(settings)
         self._variant = variant_of(settings, field)
@@ -101,8 +100,8 @@ class Localizer:
         has_common = self._common is not None or not field.is_exact
         self._stationary = StationaryCheck(settings, self._variant.reduce, has_common)
         self.recovery = Recovery(settings, field, self._landmarks, self._variant.reduce)
-        is_probabilistic = self._variant.is_probabilistic
-        self.screen = TeammateScreen(settings, gates, is_probabilistic, team, self._common)
+        common, is_probabilistic = self._common, self._variant.is_probabilistic
+        self.screen = TeammateScreen(settings, gates, is_probabilistic, team, common)
         self.landmark_beliefs = LandmarkBeliefs(settings, field, self._common, self.screen)
 
     def cycle(self, state: State, frame: Sightings) -> State:
@@ -118,7 +117,7 @@ class Localizer:
             if state.lost:
                 state = self._calibration.after_rejected(state)
             return self.recovery.check(state)
-        gated = _NO_OBJECTS
+        gated, before = _NO_OBJECTS, state.estimate
         if others:
             state, gated = self._gate.constrain(state, others, scope)  # 3. constraints
         if self.screen.is_due(state, gated):  # beyond the paper: trust
@@ -126,6 +125,8 @@ class Localizer:
         prior = state.estimate
         if self._common is None:
             estimate = self.correct(prior, landmarks, gated, scope)
+            if prior is before:  # else it is about the best pose on its arc
+                estimate = self._relinearization.after_frame(prior, estimate)
         else:
             state, estimate = self._common.correct(state, gated.accepted)
         state = self._with_frame(state, estimate, landmarks, gated, scope)
@@ -249,8 +250,7 @@ class Localizer:
     ) -> State:
         """The state with the estimate after a frame, and with the frame's counts, timers and
         rejections."""
-        used = landmarks.used
-        accepted, others_rejected = gated
+        used, (accepted, others_rejected) = landmarks.used, gated
         if accepted:
             used = used | {found.measurement.source: state.stamp_ns for found in accepted}
         rejected = len(landmarks.rejected) + len(others_rejected)

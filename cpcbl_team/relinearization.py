@@ -10,7 +10,7 @@ from collections.abc import Iterable
 from typing import Final, NamedTuple
 
 from cpcbl_team.arc_fit import ArcFit, Measure, Scalar, best_fit, least_cost
-from cpcbl_team.arcs import Arc, square_root
+from cpcbl_team.arcs import Arc, about_own_pose, square_root
 from cpcbl_team.common_error_filter import CommonErrorFilter
 from cpcbl_team.config import LocalizationSettings, LocalizerSettings
 from cpcbl_team.constraints import TELLS_NOTHING, Constraint, curved_variance
@@ -23,6 +23,11 @@ BENT_VARIANCE: Final = math.radians(5.0) ** 2  # of the heading: above, tangents
 NEARLY_KNOWN: Final = 0.2
 """The ratio of the offset's variance to what the turn adds to that of the position, and to the
 squared distance of an object, below which no more than the turn is uncertain."""
+
+BENT_SHARE: Final = 0.03
+"""The arc is used only if a reading bends along it: if its change within a sigma of the turn differs
+from the linear one, squared, by more than this share of its variance. Range and bearing to the
+landmark that an arc is about do not bend."""
 
 
 class Linearization(NamedTuple):
@@ -115,12 +120,16 @@ class Relinearization:
         self, state: State, measurements: Iterable[Measurement]
     ) -> tuple[State, Linearization | None] | None:
         """The state with its prior about the pose that fits the objects of the map best, and that
-        pose; None if another pose fits nearly as well. If its estimate is no arc, or these objects
-        leave none, the state as it is, and no pose."""
+        pose; None if another pose fits nearly as well. The state as it is, and no pose, if its
+        estimate is no arc, if these objects leave none, or if none of their readings bends along
+        it: each fit also follows the noise of its frame, so many fits would make certainty of a
+        turn that nothing measures."""
         if not self.is_due(state):
             return state, None
         arc, objects = Arc.of(state.estimate), [m for m in measurements if not m.sender]
         if not objects or not all(_leaves_arc(arc, m) for m in objects):
+            return state, None
+        if not any(_is_bent(arc, self._measure(state, m)) for m in objects):
             return state, None
         accepted: list[Measure] = []
         for m in objects:
@@ -131,6 +140,12 @@ class Relinearization:
                 accepted.append(measure)
         fit = best_fit(arc, lambda pose: [s for measure in accepted for s in measure(pose)])
         return None if fit is None else (_about(state, arc, fit.offset), Linearization(arc, fit))
+
+    def after_frame(self, prior: Estimate, estimate: Estimate) -> Estimate:
+        """The estimate after a frame that was linearized at the pose of its prior, with a
+        covariance about its own pose."""
+        is_bent = self._rules.estimates_whole_pose and prior.covariance.hh > BENT_VARIANCE
+        return about_own_pose(estimate, prior.pose) if is_bent else estimate
 
     def _measure(self, state: State, m: Measurement) -> Measure:
         """What an object says, with the errors of its place and of the camera as noise."""
@@ -146,6 +161,22 @@ class Relinearization:
             ]
 
         return measure
+
+
+def _is_bent(arc: Arc, measure: Measure) -> bool:
+    """Whether a reading bends along the arc, within a sigma of the turn."""
+    sigma = math.sqrt(arc.covariance.hh)
+    before, here, after = (measure(arc.at((0.0, 0.0, turn))) for turn in (-sigma, 0.0, sigma))
+    if not len(before) == len(here) == len(after):  # a pose on it touches the object
+        return True
+    for (_, first, _), (row, middle, variance), (_, last, _) in zip(
+        before, here, after, strict=True
+    ):
+        steps = first - middle, last - middle
+        bend = 0.5 * sum(map(wrap_angle, steps) if row[2] else steps)
+        if bend * bend > BENT_SHARE * variance:
+            return True
+    return False
 
 
 def _leaves_arc(arc: Arc, m: Measurement) -> bool:

@@ -14,6 +14,7 @@ from cpcbl_launch.team.overrides import with_blind_robots
 from cpcbl_team.config import (
     Field,
     Gives,
+    Landmark,
     LandmarkPosition,
     OdometrySettings,
     PositionSensor,
@@ -25,9 +26,15 @@ from cpcbl_team.config import (
 )
 
 DURATION_S = 40.0
+BAD_S = 65.0  # in which the heading of a robot with bad odometry becomes as uncertain as it will
 LEARNING_S = 60.0  # for a robot whose settings are wrong
 AWAY = SimulationEvent(at_s=10.0, kidnap="r", to=(5.5, 4.0, 200.0))
 ZIGZAG = ((3.0, 2.5), (3.4, 3.5), (3.8, 2.5), (4.2, 3.5), (4.6, 2.5), (4.2, 3.6))
+BAD_ODOMETRY = OdometrySettings(
+    distance_sigma_m_per_sqrt_m=0.15,
+    turn_sigma_rad_per_sqrt_rad=0.25,
+    turn_sigma_rad_per_sqrt_m=0.15,
+)
 KINDS = ("both", ""), ("range", " range-only"), ("bearing", " bearing-only")
 
 
@@ -115,7 +122,7 @@ def worlds() -> dict[str, World]:
     for gives, text in KINDS[1:]:
         team = with_settings(_alone(_field(4, gives)), None, start=wide)
         found[f"wide prior{text}"] = World(team, ("r",))
-    found |= _odometry_worlds() | _wheel_worlds() | _turned_sensor_worlds()
+    found |= _bad_odometry_worlds() | _odometry_worlds() | _wheel_worlds() | _turned_sensor_worlds()
     found |= _unknown_pose_worlds()
     found |= _team_worlds() | _miscalibrated_worlds()
     return found | _uncertain_map_worlds() | _unsurveyed_worlds()
@@ -123,6 +130,21 @@ def worlds() -> dict[str, World]:
 
 def _landmarks(count: int) -> str:
     return f"{count} landmark{'' if count == 1 else 's'}"
+
+
+def _bad_odometry_worlds() -> dict[str, World]:
+    """The odometry and the sensor of figure 7's navigator: where little else is known, the heading
+    becomes uncertain."""
+    middle = Field(landmarks={"middle": Landmark(x_m=4.0, y_m=3.0)})
+    fields = {_landmarks(count): _field(count) for count in (1, 2)}
+    fields["1 landmark in the middle"] = middle
+    sensor = replace(all_robots().robots["a"].sensor, bearing_sigma_deg=5.0)
+    teams = {
+        text: _alone(field, odometry=BAD_ODOMETRY, sensor=sensor) for text, field in fields.items()
+    }
+    return {
+        f"bad odometry, {text}": World(t, ("r",), duration_s=BAD_S) for text, t in teams.items()
+    }
 
 
 def _odometry_worlds() -> dict[str, World]:
