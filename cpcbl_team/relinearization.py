@@ -25,9 +25,9 @@ NEARLY_KNOWN: Final = 0.2
 squared distance of an object, below which no more than the turn is uncertain."""
 
 BENT_SHARE: Final = 0.03
-"""The arc is used only if a reading bends along it: if its change within a sigma of the turn differs
-from the linear one, squared, by more than this share of its variance. Range and bearing to the
-landmark that an arc is about do not bend."""
+"""The arc is used only if a reading bends along it: if the square of what a linear form leaves out
+within a sigma of the turn is more than this share of the reading's variance. Range and bearing to
+the landmark that an arc is about do not bend."""
 
 
 class Linearization(NamedTuple):

@@ -144,8 +144,9 @@ def test_it_is_as_certain_as_it_may_be_before_and_after(
 def test_many_frames_make_no_certainty_of_a_turn_about_the_only_landmark(
     post: tuple[float, float], share: float, bearing_deg: float, seeds: range
 ) -> None:
-    """Each frame was linearized where it fitted best, and so followed its own noise: a NEES of 7 and
-    8, 83 and 85 % inside 3 sigma beside the circle (seeds 0 to 39; now 2.2 and 2.4, 96 and 95 %)."""
+    """Each frame was linearized where it fitted best, and so followed its own noise: beside the
+    circle a NEES of 7 and 8, 83 and 85 % inside 3 sigma (seeds 0 to 39). Now it is 2.2 and 2.4, 96
+    and 95 %."""
     found = scored([circling(post, share, bearing_deg, seed) for seed in seeds], 25, 300)
     assert found.nees is not None
     assert found.inside_3_sigma is not None
