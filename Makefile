@@ -42,9 +42,10 @@ check: setup
 	$(BIN)/mypy
 	PYTHONPATH=.:agents:transport:launch $(BIN)/lint-imports --no-cache
 
-# More workers than cores: many tests wait for the processes that they started.
+# One worker more than cores: many tests wait for the processes that they started. Each worker finds
+# all tests anew, and in a new clone compiles them.
 unit: setup
-	$(BIN)/pytest -n 4 --dist worksteal -m "$(USUAL)"
+	$(BIN)/pytest -n 3 --dist worksteal -m "$(USUAL)"
 
 # More worlds, seeds, images and attacks than `make test` samples, with the same bounds.
 test-thorough: setup

@@ -20,6 +20,11 @@ def over_seeds(few: int, many: int, more: int = 0) -> pytest.MarkDecorator:
     return pytest.mark.parametrize("seeds", seeds)
 
 
+def thorough(*values: Any) -> Any:
+    """A row of a table of parameters, for `make test-thorough` alone."""
+    return pytest.param(*values, marks=pytest.mark.thorough)
+
+
 def sampled(
     values: Iterable[Any], always: Collection[Any], name: Callable[[Any], str] = str
 ) -> list[Any]:

@@ -43,8 +43,6 @@ QUICK = (  # the worlds of the findings, each as short as it may be
 ALWAYS = (
     "1 landmark bearing-only",
     "50% of odometry lost, 4 landmarks",
-    "carried away, 2 landmarks",
-    "helper with heading σ 20 deg",
     "uncertain map, 2 landmarks",
 )
 
