@@ -43,9 +43,12 @@ check: setup
 	PYTHONPATH=.:agents:transport:launch $(BIN)/lint-imports --no-cache
 
 # One worker more than cores: many tests wait for the processes that they started. Each worker finds
-# all tests anew, and in a new clone compiles them.
-unit: setup
+# all tests anew. In a new clone each would compile them as well, at the same time.
+unit: $(VENV)/compiled-tests
 	$(BIN)/pytest -n 3 --dist worksteal -m "$(USUAL)"
+
+$(VENV)/compiled-tests: $(VENV)/ready
+	@$(BIN)/pytest --collect-only -q > $@
 
 # More worlds, seeds, images and attacks than `make test` samples, with the same bounds.
 test-thorough: setup
