@@ -324,8 +324,7 @@ def test_two_different_frames_of_one_time_are_both_used() -> None:
 
 def test_an_input_older_than_the_horizon_is_refused() -> None:
     timeline = after(localizer("joint", MIXED), history(5.0))
-    newest = time_of(history(5.0)[-1])
-    before = timeline.state
+    newest, before = time_of(history(5.0)[-1]), timeline.state
     assert timeline.add(fix(0.0, 0.0, newest - HORIZON_NS - 1)) == "too_late"
     assert timeline.state is before
     assert timeline.add(fix(0.0, 0.0, newest - HORIZON_NS)) is None
