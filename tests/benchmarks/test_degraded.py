@@ -54,7 +54,8 @@ def test_standard_tags_are_recalled_and_none_is_wrong(kind: str) -> None:
     assert max(max(errors, default=0.0) for errors in score.errors.values()) < 3.0
 
 
-@pytest.mark.parametrize("kind", sampled(KINDS, ["motion blur"]))
+@pytest.mark.thorough
+@pytest.mark.parametrize("kind", KINDS)
 def test_markers_of_a_bad_camera_are_recalled_and_none_is_wrong(kind: str) -> None:
     score = score_without_wrong(kind, "apriltag_36h11")
     assert score.recall >= LEAST_RECALL[kind]

@@ -42,15 +42,9 @@ def take_late_fixes_for_new(agent: FilterAgent, item: Input) -> bool:
     return _add(agent, item)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("seed", SEEDS)
-@pytest.mark.parametrize(
-    "world",
-    [
-        pytest.param(rumour, marks=pytest.mark.thorough),
-        late_help,
-        pytest.param(overconfident_liar, marks=pytest.mark.thorough),
-    ],
-)
+@pytest.mark.parametrize("world", [rumour, late_help, overconfident_liar])
 def test_with_all_rules_the_stated_uncertainties_hold(
     world: Callable[[], World], seed: int
 ) -> None:
