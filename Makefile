@@ -42,9 +42,13 @@ check: setup
 	$(BIN)/mypy
 	PYTHONPATH=.:agents:transport:launch $(BIN)/lint-imports --no-cache
 
-# More workers than cores: many tests wait for the processes that they started.
-unit: setup
-	$(BIN)/pytest -n 4 --dist worksteal -m "$(USUAL)"
+# One worker more than cores: many tests wait for the processes that they started. Each worker finds
+# all tests anew. In a new clone each would compile them as well, at the same time.
+unit: $(VENV)/compiled-tests
+	$(BIN)/pytest -n 3 --dist worksteal -m "$(USUAL)"
+
+$(VENV)/compiled-tests: $(VENV)/ready
+	@$(BIN)/pytest --collect-only -q > $@
 
 # More worlds, seeds, images and attacks than `make test` samples, with the same bounds.
 test-thorough: setup

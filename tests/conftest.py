@@ -47,8 +47,10 @@ def pytest_collection() -> None:
 
 
 def pytest_collection_finish() -> None:
+    """Looks for garbage more seldom than usual: of what tests make, little refers to itself."""
     gc.enable()
     gc.freeze()
+    gc.set_threshold(20_000, 20, 20)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

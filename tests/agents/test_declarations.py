@@ -118,7 +118,7 @@ def test_a_key_that_is_no_robots_token_gives_none(key: str, there: bool) -> None
     assert tokens.update(alive(7), True) == Presence("mate", 7)
 
 
-@examples(200)
+@examples(100)
 @given(st.text(alphabet="alive/0123456789mate-*x", max_size=30), st.booleans())
 def test_no_key_raises(key: str, there: bool) -> None:
     presence = LivelinessTokens().update(key, there)
@@ -131,7 +131,7 @@ CHANGES = st.lists(
 )
 
 
-@examples(200)
+@examples(100)
 @given(CHANGES)
 def test_the_newest_of_what_is_there_counts(changes: list[tuple[str, int, bool]]) -> None:
     tokens, there = LivelinessTokens(), list[tuple[str, int]]()

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 from msgspec.structs import replace
 from support.drivers import PLACES, Drive, DrivenRobot, World
+from support.sweeps import thorough
 
 from cpcbl_agents.node import Node, NodeCallbacks, NodeStart
 from cpcbl_agents.robot import build_robot
@@ -78,8 +79,9 @@ def said_of(seeds: range) -> dict[int, set[str]]:
     return said
 
 
-def test_nothing_is_said_of_good_drivers() -> None:
-    assert said_of(range(10)) == {}
+@pytest.mark.parametrize("seeds", [range(5), thorough(range(5, 10))], ids=["5", "5 more"])
+def test_nothing_is_said_of_good_drivers(seeds: range) -> None:
+    assert said_of(seeds) == {}
 
 
 @pytest.mark.long

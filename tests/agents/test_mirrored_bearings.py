@@ -43,7 +43,7 @@ def beyond_3_sigma_m(robot: DrivenRobot) -> float:
         pytest.param(TO_AND_FRO, 2.25, 4.41, 109, True, marks=pytest.mark.thorough),
         pytest.param(TO_AND_FRO, 1.5, 1.47, 103, True, marks=pytest.mark.thorough),
         pytest.param(NOISY, 0.75, 0.98, 102, False, marks=pytest.mark.thorough),
-        (NOISY, 2.25, 0.49, 101, False),
+        pytest.param(NOISY, 2.25, 0.49, 101, False, marks=pytest.mark.thorough),
     ],
 )
 def test_the_estimate_stays(

@@ -124,7 +124,7 @@ def test_headers_of_whole_pictures(progressive: int) -> None:
     assert read_header(png(LEVELS_16)) == Header(*SIZE, 3, 16)
 
 
-@examples(300)
+@examples(150)
 @given(st.binary(max_size=200), st.sampled_from([b"", JPEG[:20], PNG[:20], b"\xff\xd8\xff"]))
 def test_nothing_raises(noise: bytes, head: bytes) -> None:
     assert isinstance(decode_frame(head + noise, SIZE), str)

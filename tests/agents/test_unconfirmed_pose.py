@@ -8,6 +8,7 @@ from support.collaboration import POOR, Alone, ahead
 from support.drivers import DrivenRobot, World
 from support.mistake_rows import ODOMETRY, SEEN
 from support.mistakes import bearings, of
+from support.sweeps import thorough
 
 from cpcbl_agents.agent import BeliefSubscribers, Presence
 from cpcbl_team.config import OdometrySettings, Start
@@ -46,7 +47,9 @@ def is_wrong(robot: DrivenRobot) -> bool:
 
 
 @pytest.mark.parametrize("mistake", [*OF_BEARINGS, *OF_TURNS])
-@pytest.mark.parametrize("world", [ARC, SPIN, STAND], ids=["arc", "spin", "stand"])
+@pytest.mark.parametrize(
+    "world", [ARC, thorough(SPIN), thorough(STAND)], ids=["arc", "spin", "stand"]
+)
 def test_no_wrong_pose_is_ok(world: World, mistake: str) -> None:
     robot, change = DrivenRobot(world), {**SEEN, **ODOMETRY}[mistake].make()
     robot.run(1.1, change)

@@ -14,7 +14,7 @@ from benchmarks.degraded import Score, false_markers, measured, printed
 from benchmarks.degraded_frames import KINDS, Pixels, textures
 from benchmarks.photographs import tags_read
 from benchmarks.readers import opencv_reader, own_reader
-from support.sweeps import sampled
+from support.sweeps import sampled, thorough
 
 from cpcbl_agents.vision.marker_families import opencv_dictionary
 from cpcbl_team.config import MarkerFamily
@@ -54,7 +54,8 @@ def test_standard_tags_are_recalled_and_none_is_wrong(kind: str) -> None:
     assert max(max(errors, default=0.0) for errors in score.errors.values()) < 3.0
 
 
-@pytest.mark.parametrize("kind", sampled(KINDS, ["clean", "motion blur"]))
+@pytest.mark.thorough
+@pytest.mark.parametrize("kind", KINDS)
 def test_markers_of_a_bad_camera_are_recalled_and_none_is_wrong(kind: str) -> None:
     score = score_without_wrong(kind, "apriltag_36h11")
     assert score.recall >= LEAST_RECALL[kind]
@@ -64,7 +65,7 @@ def test_markers_of_a_bad_camera_are_recalled_and_none_is_wrong(kind: str) -> No
     assert printed([score], ()).row_count == 1
 
 
-@pytest.mark.parametrize("frames", [16, pytest.param(40, marks=pytest.mark.long)])
+@pytest.mark.parametrize("frames", [6, thorough(16), pytest.param(40, marks=pytest.mark.long)])
 def test_no_marker_is_in_pictures_without_one(frames: int) -> None:
     """The families whose codes are the shortest are the likeliest to be seen where there are none;
     `make bench-degraded` has natural pictures."""

@@ -276,13 +276,13 @@ def test_the_number_of_jobs_changes_no_figure() -> None:
 
 
 def test_the_benchmark_shows_targets_and_writes_json_and_picture(tmp_path: Path) -> None:
-    done = run_benchmark("detection", "--frames", 12, "--jobs", 1, "--output", tmp_path)
+    done = run_benchmark("detection", "--frames", 6, "--jobs", 1, "--output", tmp_path)
     assert done.returncode == 0, done.stderr
     assert "no wrong id" in done.stdout
     assert "…" not in done.stdout
     assert all(len(line) <= 80 for line in done.stdout.splitlines() if "written" not in line)
     written = json.loads((tmp_path / "eyes.json").read_text())
-    assert written["frames"] == 12
+    assert written["frames"] == 6
     assert written["within"]["landmark"]["to_m"] == 5.0
     assert (tmp_path / "eyes.png").read_bytes().startswith(PNG)
 

@@ -11,7 +11,6 @@ import pytest
 from benchmarks.degraded_frames import Pixels, textures
 from benchmarks.landmark_frames import LIGHTS, LightKind, Lit
 from benchmarks.shaded_landmarks import false_landmarks, printed, score_of, shaded_frames
-from support.sweeps import sampled
 
 from cpcbl_agents.vision import cylinders
 
@@ -29,7 +28,8 @@ def frames_of(light: LightKind, count: int = FEW) -> list[tuple[str, Lit]]:
 
 
 @pytest.mark.parametrize("count", [FEW, pytest.param(MANY, marks=pytest.mark.long)])
-@pytest.mark.parametrize("light", sampled(LIGHTS, ["low light"]))
+@pytest.mark.thorough
+@pytest.mark.parametrize("light", LIGHTS)
 def test_landmarks_in_any_light_are_ranged_and_none_is_wrong(light: LightKind, count: int) -> None:
     score = score_of(light, frames_of(light, count))
     assert score.wrong == 0

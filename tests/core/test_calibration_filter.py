@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 from support.core import EXACT, SECOND, diagonal
+from support.sweeps import sampled, thorough
 
 from cpcbl_team.calibration_filter import (
     FILTERS,
@@ -113,7 +114,7 @@ def filters_after(
     )
 
 
-@pytest.mark.parametrize("view_deg", [25.0, 60.0, 180.0])
+@pytest.mark.parametrize("view_deg", sampled([25.0, 60.0, 180.0], [25.0]))
 @pytest.mark.parametrize(
     "truth",
     [
@@ -136,8 +137,9 @@ def test_errors_are_found_whatever_the_view(truth: Truth, view_deg: float) -> No
 
 
 @pytest.mark.parametrize("view_deg", [25.0, 180.0])
-def test_right_settings_are_left_alone(view_deg: float) -> None:
-    for seed in range(8):
+@pytest.mark.parametrize("seeds", [range(2), thorough(range(2, 8))], ids=["2", "6"])
+def test_right_settings_are_left_alone(view_deg: float, seeds: range) -> None:
+    for seed in seeds:
         frames = drives(Truth(), seed, Sensor(view=math.radians(view_deg)))
         filters = filters_after(frames[:3])
         for i in range(3, len(frames), 3):
@@ -162,7 +164,7 @@ def test_exact_readings_give_the_exact_errors() -> None:
     assert known.errors == pytest.approx(truth, abs=2e-3)
 
 
-@pytest.mark.parametrize("names", ["a", "ab", "abc", "abcde"])
+@pytest.mark.parametrize("names", sampled(["a", "ab", "abc", "abcde"], ["ab"]))
 def test_a_robot_that_stands_finds_nothing(names: str) -> None:
     """The noise of a few bearings seems to tell a scale from a bias of ranges."""
     sensor = Sensor(range_m=0.02, bearing=math.radians(1.0), names=names)
@@ -175,7 +177,7 @@ def test_a_robot_that_stands_finds_nothing(names: str) -> None:
             assert correction(filters, AS_CONFIGURED) is None
 
 
-@pytest.mark.parametrize("view_deg", [35.0, 180.0])
+@pytest.mark.parametrize("view_deg", sampled([35.0, 180.0], [35.0]))
 @pytest.mark.parametrize("moved_m", [0.3, 0.8])
 @pytest.mark.parametrize("name", ["b", "e"])
 def test_one_landmark_that_stands_elsewhere_is_no_error_of_the_sensor(

@@ -9,6 +9,7 @@ import pytest
 from msgspec.structs import replace
 from support.core import CORNERS, SECOND, fix, localizer, matrix3
 from support.observed_drive import Drive, Observed, correct, faulty
+from support.sweeps import sampled
 from support.trust import AGREES, RULES
 
 from cpcbl_team.config import Field, Start, Unsurveyed
@@ -181,19 +182,21 @@ def silent_for_a_while(
     return None if 15 * SECOND < ns < 24 * SECOND else correct(ns, truth, rng)
 
 
-def test_without_a_majority_sigma_holds_though_a_correct_observer_is_silent_for_a_while() -> None:
-    for seed in range(2):
-        observers: dict[str, Observed] = {
-            "a": correct,
-            "b": silent_for_a_while,
-            "c": drifting,
-            "d": drifting,
-        }
-        drive = Drive(observers, seed=seed, rounds=3)
-        assert drive.quarantines == {}
-        assert drive.inside_3_sigma > 0.95
-        assert math.degrees(drive.state.estimate.heading_sigma_rad) < 60.0
-        assert "lost" not in drive.state.counts
+@pytest.mark.parametrize("seed", sampled(range(2), [1]))
+def test_without_a_majority_sigma_holds_though_a_correct_observer_is_silent_for_a_while(
+    seed: int,
+) -> None:
+    observers: dict[str, Observed] = {
+        "a": correct,
+        "b": silent_for_a_while,
+        "c": drifting,
+        "d": drifting,
+    }
+    drive = Drive(observers, seed=seed, rounds=3)
+    assert drive.quarantines == {}
+    assert drive.inside_3_sigma > 0.95
+    assert math.degrees(drive.state.estimate.heading_sigma_rad) < 60.0
+    assert "lost" not in drive.state.counts
 
 
 def test_where_half_are_suddenly_wrong_the_contest_lasts_and_sigma_holds() -> None:

@@ -13,6 +13,7 @@ from support.core import (
     matrix3,
     random_matrix,
 )
+from support.sweeps import sampled
 
 from cpcbl_team.config import OdometryNoise
 from cpcbl_team.estimate import (
@@ -351,7 +352,7 @@ def an_event(rng: np.random.Generator, estimate: Estimate, scope: Scope) -> Esti
 
 
 @pytest.mark.parametrize("alternating", [False, True])
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", sampled(range(4), [0]))
 def test_covariances_stay_covariances_through_long_histories(seed: int, alternating: bool) -> None:
     rng = np.random.default_rng(seed)
     estimate = Estimate(POSE, covariance3(random_matrix(rng, 3)))

@@ -17,7 +17,7 @@ from support.core import (
     state_at,
 )
 from support.standing import FORMULAS
-from support.sweeps import sampled
+from support.sweeps import sampled, thorough
 
 from cpcbl_team.arcs import arc_variance
 from cpcbl_team.config import Field, OdometrySettings, SensorSettings
@@ -114,7 +114,7 @@ def test_a_fix_stands_where_the_mean_of_its_sighting_is(share: float, sigma_deg:
 
 
 @pytest.mark.parametrize("interval_s", sampled([0.2, 2.0], [0.2]))
-@pytest.mark.parametrize(("share", "sigma_deg"), [(0.1, 2.0), (0.03, 5.0)])
+@pytest.mark.parametrize(("share", "sigma_deg"), [(0.1, 2.0), thorough(0.03, 5.0)])
 def test_fixes_that_repeat_do_not_pull_a_teammate(
     interval_s: float, share: float, sigma_deg: float
 ) -> None:
@@ -141,7 +141,7 @@ def test_fixes_that_repeat_do_not_pull_a_teammate(
     assert np.std(errors) < 1.3
 
 
-@pytest.mark.parametrize("rate_hz", [5.0, 20.0])
+@pytest.mark.parametrize("rate_hz", sampled([5.0, 20.0], [20.0]))
 def test_no_fixes_are_chosen_by_their_own_errors(rate_hz: float) -> None:
     """A standing observer with a wide bearing helps a standing teammate whose estimate may hold all
     of the observer's error. Of many fixes covariance intersection takes those that make its

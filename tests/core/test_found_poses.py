@@ -10,7 +10,7 @@ import pytest
 from support.core import SECOND, frame, localizer, matrix3, sensor_noise, state_at
 from support.core import diagonal as diagonal_of
 from support.evidence import piece
-from support.sweeps import over_seeds
+from support.sweeps import over_seeds, thorough
 
 from cpcbl_team.config import Field, Gives, Landmark, OdometrySettings, SensorSettings, Variant
 from cpcbl_team.estimate import Estimate
@@ -143,13 +143,13 @@ LONG = [
         ("bearing", 2, "joint"),
         ("range", 1, "joint"),
         ("range", 2, "joint"),
-        ("range", 2, "oval"),
-        ("range", 2, "circular"),
+        thorough("range", 2, "oval"),
+        thorough("range", 2, "circular"),
         ("range", 4, "joint"),
         ("bearing", 3, "joint"),
         ("both", 1, "joint"),
-        ("both", 1, "oval"),
-        ("both", 1, "circular"),
+        thorough("both", 1, "oval"),
+        thorough("both", 1, "circular"),
         ("both", 2, "joint"),
         *LONG,
     ],

@@ -295,7 +295,7 @@ def runs(
 
 
 @over_seeds(16, 40)
-@variants
+@pytest.mark.parametrize("variant", sampled(VARIANTS, ["joint"]))
 def test_fixes_with_a_heading_improve_the_heading_of_a_blind_robot(
     variant: Variant, seeds: range
 ) -> None:

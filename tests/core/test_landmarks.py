@@ -160,7 +160,7 @@ def composed(robot: Localizer, state: State, frame: Sightings) -> tuple[Estimate
     return with_circular_position(after) if r.variant == "circular" else after, counts
 
 
-@settings(max_examples=400)
+@settings(max_examples=200)
 @given(fields, readings, sensors, rules, st.integers(0, 2**32 - 1))
 def test_a_frame_gives_the_evidence_of_its_constraints_one_by_one(
     field: Field,

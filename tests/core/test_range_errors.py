@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 from support.core import SECOND, diagonal, frame, localizer, state_at
+from support.sweeps import thorough
 
 from cpcbl_team.calibration_memory import CalibrationMemory
 from cpcbl_team.config import SensorSettings, Variant
@@ -16,7 +17,8 @@ from cpcbl_team.state import Memory
 
 
 @pytest.mark.parametrize(
-    ("variant", "correlation_s"), [("joint", 0.0), ("joint", 2.0), ("oval", 0.0), ("circular", 0.0)]
+    ("variant", "correlation_s"),
+    [("joint", 0.0), thorough("joint", 2.0), ("oval", 0.0), thorough("circular", 0.0)],
 )
 def test_a_robot_whose_ranges_are_short_says_so_and_corrects_them(
     variant: Variant, correlation_s: float

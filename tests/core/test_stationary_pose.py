@@ -17,6 +17,7 @@ from support.core import (
     sensor_noise,
 )
 from support.standing import ORIGIN, standing
+from support.sweeps import sampled
 
 from cpcbl_team.config import Field, Landmark, SensorSettings, Variant
 from cpcbl_team.estimate import Covariance3, Estimate, Information, Sums
@@ -64,7 +65,7 @@ def nees(state: State, truth: Pose2) -> float:
     return covariance.position().mahalanobis_squared(x - truth.x, y - truth.y)
 
 
-@pytest.mark.parametrize("variant", PROBABILISTIC)
+@pytest.mark.parametrize("variant", sampled(PROBABILISTIC, ["oval"]))
 def test_a_robot_that_is_pushed_by_less_than_its_gates_finds_out(variant: Variant) -> None:
     robot = standing(variant, sensor=POOR)
     states = [stood(robot, seed, push=PUSHED) for seed in range(12)]
@@ -74,7 +75,7 @@ def test_a_robot_that_is_pushed_by_less_than_its_gates_finds_out(variant: Varian
     assert max(nees(state, PUSHED) for state in states) < 20.0
 
 
-@pytest.mark.parametrize("variant", PROBABILISTIC)
+@pytest.mark.parametrize("variant", sampled(PROBABILISTIC, ["joint"]))
 def test_a_robot_that_stands_where_it_believes_doubts_nothing(variant: Variant) -> None:
     robot = standing(variant, sensor=POOR)
     states = [stood(robot, seed, until_s=40) for seed in range(12)]

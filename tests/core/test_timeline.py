@@ -26,6 +26,7 @@ from support.core import (
     sensor_noise,
     state_at,
 )
+from support.sweeps import sampled
 
 from cpcbl_team.config import LocalizerSettings, SensorSettings, Variant
 from cpcbl_team.inputs import Belief, BeliefShared, Fix, Input, Odometry, Position, Sightings
@@ -39,6 +40,7 @@ MS = SECOND // 1000
 START = state_at(LOOP_START, diagonal(0.05, 0.05))
 
 variants = pytest.mark.parametrize("variant", VARIANTS)
+two_variants = pytest.mark.parametrize("variant", sampled(VARIANTS, ["joint", "weighted"]))
 
 
 def history(seconds: float, seed: int = 1) -> list[Input]:
@@ -114,7 +116,7 @@ def test_inputs_in_order_give_the_states_of_the_localizer(variant: Variant) -> N
     assert same(after(robot, inputs).state, by_hand(robot, inputs))
 
 
-@variants
+@two_variants
 @settings(max_examples=8)
 @given(shuffler=st.randoms(use_true_random=False))
 def test_any_order_within_the_horizon_gives_the_same_state(
@@ -251,7 +253,7 @@ told_at = st.builds(
 )
 
 
-@variants
+@two_variants
 @settings(max_examples=15)
 @given(
     beliefs=st.lists(told_at, max_size=12, unique_by=repr),
@@ -322,8 +324,7 @@ def test_two_different_frames_of_one_time_are_both_used() -> None:
 
 def test_an_input_older_than_the_horizon_is_refused() -> None:
     timeline = after(localizer("joint", MIXED), history(5.0))
-    newest = time_of(history(5.0)[-1])
-    before = timeline.state
+    newest, before = time_of(history(5.0)[-1]), timeline.state
     assert timeline.add(fix(0.0, 0.0, newest - HORIZON_NS - 1)) == "too_late"
     assert timeline.state is before
     assert timeline.add(fix(0.0, 0.0, newest - HORIZON_NS)) is None

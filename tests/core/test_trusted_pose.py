@@ -19,6 +19,7 @@ from support.core import (
     sensor_noise,
     state_at,
 )
+from support.sweeps import thorough
 
 from cpcbl_team.config import SensorSettings
 from cpcbl_team.geometry import Pose2, wrap_angle
@@ -67,7 +68,7 @@ def states(
     return list(followed(robot, begin, LOOP_START, way, names=lambda _: names, noise=noise))
 
 
-@pytest.mark.parametrize("names", [TWO, ALL], ids=["2", "4"])
+@pytest.mark.parametrize("names", [TWO, thorough(ALL)], ids=["2", "4"])
 @pytest.mark.parametrize("way", [STAND, SPIN, loop()[:60]], ids=["stand", "spin", "drive"])
 @pytest.mark.parametrize(
     ("noise", "cause"),

@@ -19,7 +19,7 @@ from support.core import (
     sensor_noise,
     state_at,
 )
-from support.sweeps import over_seeds, sampled
+from support.sweeps import over_seeds, sampled, thorough
 
 from cpcbl_launch.reporting.metrics import Samples, Score, score
 from cpcbl_team.arc_fit import ArcFit
@@ -114,7 +114,13 @@ def scored(runs: list[Drive], first: int, last: int) -> Score:
 @pytest.mark.parametrize("sigma_deg", sampled([10.0, 20.0, 45.0], [45.0]))
 @pytest.mark.parametrize(
     "landmarks",
-    [ONE, FOUR, giving("range"), giving("bearing"), giving("bearing", "ac")],
+    [
+        ONE,
+        thorough(FOUR),
+        thorough(giving("range")),
+        giving("bearing"),
+        thorough(giving("bearing", "ac")),
+    ],
     ids=["one", "four", "four ranges", "four bearings", "two bearings"],
 )
 def test_it_is_as_certain_as_it_may_be_before_and_after(

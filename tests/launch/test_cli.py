@@ -220,20 +220,6 @@ def test_up_reports_to_file_and_standard_output(tmp_path: Path) -> None:
     assert not pids_of(["cpcbl_launch", str(tmp_path)])
 
 
-def test_up_shows_a_table_and_draws_a_picture(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    picture = tmp_path / "run.png"
-    (tmp_path / "team.toml").write_text(PAIR)
-    monkeypatch.chdir(tmp_path)
-    ran = cpcbl_team("up", "team.toml", "--duration", 3, "--picture", picture)
-    assert ran.returncode == 0, ran.stderr
-    for word in ("driver", "watcher", "err m", "RMSE m", "NEES"):
-        assert word in ran.stdout
-    assert max(map(len, ran.stdout.splitlines())) <= 80
-    assert picture.read_bytes().startswith(b"\x89PNG")
-
-
 def test_ctrl_c_ends_a_run_with_its_report_and_leaves_no_process(tmp_path: Path) -> None:
     team = tmp_path / "team.toml"
     team.write_text(PAIR.replace('"pair"', '"ctrl-c"'))
@@ -249,7 +235,7 @@ def test_ctrl_c_ends_a_run_with_its_report_and_leaves_no_process(tmp_path: Path)
 
 def test_up_on_a_log_agrees_with_evaluate(tmp_path: Path) -> None:
     write_log(tmp_path, ("1", "2"), seconds=40.0)
-    evaluated = cpcbl_team("evaluate", PLAIN, tmp_path, "--blind", "2", "--json")
+    evaluated = command_line("evaluate", PLAIN, tmp_path, "--blind", "2", "--json")
     assert evaluated.returncode == 0, evaluated.stderr
     ran = patient_up(PLAIN, "--data", tmp_path, "--blind", "2", "--speed", 5, "--json")
     assert ran.returncode == 0, ran.stderr
@@ -263,15 +249,25 @@ def test_up_on_a_log_agrees_with_evaluate(tmp_path: Path) -> None:
         assert alone["robots"][name]["position_rmse_m"] < 0.02
 
 
-def test_a_team_spreads_over_machines_by_an_endpoint_in_its_file(tmp_path: Path) -> None:
-    endpoint, team = free_endpoint(), tmp_path / "team.toml"
-    team.write_text(f'{PAIR}\n[transport]\nlisten = ["{endpoint}"]\nconnect = ["{endpoint}"]\n')
-    elsewhere = [*PROGRAM, "robot", str(team), "watcher"]
+def test_a_team_spreads_over_machines_by_an_endpoint_in_its_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its run is shown as a table, and drawn."""
+    endpoint, written, picture = free_endpoint(), tmp_path / "report.json", tmp_path / "run.png"
+    text = f'{PAIR}\n[transport]\nlisten = ["{endpoint}"]\nconnect = ["{endpoint}"]\n'
+    (tmp_path / "team.toml").write_text(text)
+    monkeypatch.chdir(tmp_path)
+    elsewhere = [*PROGRAM, "robot", "team.toml", "watcher"]
+    options = ("--duration", 8, "--picture", picture, "--report", written)
     with subprocess.Popen(elsewhere, stderr=subprocess.DEVNULL) as other:
-        ran = cpcbl_team("up", team, "--robots", "driver", "--duration", 8, "--json")
+        ran = cpcbl_team("up", "team.toml", "--robots", "driver", *options)
         other.send_signal(signal.SIGINT)
         other.wait(timeout=30.0)
     assert ran.returncode == 0, ran.stderr
-    report = json.loads(ran.stdout)
+    report = json.loads(written.read_text())
     assert report["robots"]["watcher"]["samples"] > 0
     assert report["robots"]["driver"]["messages_received"] > 0
+    for word in ("driver", "watcher", "err m", "RMSE m", "NEES"):
+        assert word in ran.stdout
+    assert max(map(len, ran.stdout.splitlines())) <= 80
+    assert picture.read_bytes().startswith(b"\x89PNG")

@@ -8,6 +8,7 @@ import subprocess
 import sys
 
 import pytest
+from support.sweeps import sampled
 
 from cpcbl_launch.team.file import builtin_path
 
@@ -49,8 +50,9 @@ WORK = {
 }
 
 
-@pytest.mark.parametrize(("imports", "expression"), WORK.values(), ids=WORK)
-def test_threads_that_meet_a_type_at_once_get_the_same(imports: str, expression: str) -> None:
+@pytest.mark.parametrize("work", sampled(WORK, ["a team file", "an input as JSON"]))
+def test_threads_that_meet_a_type_at_once_get_the_same(work: str) -> None:
+    imports, expression = WORK[work]
     program = PROGRAM.format(imports=imports, expression=expression)
     for _ in range(PROCESSES):
         ran = subprocess.run(

@@ -47,7 +47,7 @@ def matches(keys: str, key: str) -> bool:
 
 
 def examples(count: int) -> settings:
-    """So many examples of hypothesis."""
+    """So many examples of hypothesis, which are others in every run."""
     return settings(max_examples=count)
 
 

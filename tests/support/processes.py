@@ -94,10 +94,12 @@ def pids_of(words: Sequence[str]) -> list[int]:
 
 
 def eventually(condition: Callable[[], bool], within_s: float = 40.0) -> bool:
-    """Whether a condition comes true in time."""
-    until = time.monotonic() + within_s
+    """Whether a condition comes true in time. Some conditions start a program, so it asks ever more
+    seldom."""
+    until, pause_s = time.monotonic() + within_s, 0.02
     while time.monotonic() < until:
         if condition():
             return True
-        time.sleep(0.02)
+        time.sleep(pause_s)
+        pause_s = min(1.1 * pause_s, 0.1)
     return condition()

@@ -11,13 +11,18 @@ import pytest
 
 
 def over_seeds(few: int, many: int, more: int = 0) -> pytest.MarkDecorator:
-    """Gives a test its `seeds`: the first few always, if there are `more` these in `make
+    """Gives a test its `seeds`: the first few always, if any, if there are `more` these in `make
     test-thorough`, and all of them in `make test-long`."""
-    seeds = [pytest.param(range(few), id=str(few))]
+    seeds = [pytest.param(range(few), id=str(few))] if few else []
     if more:
         seeds.append(pytest.param(range(more), id=str(more), marks=pytest.mark.thorough))
     seeds.append(pytest.param(range(many), id=str(many), marks=pytest.mark.long))
     return pytest.mark.parametrize("seeds", seeds)
+
+
+def thorough(*values: Any) -> Any:
+    """A row of a table of parameters, for `make test-thorough` alone."""
+    return pytest.param(*values, marks=pytest.mark.thorough)
 
 
 def sampled(

@@ -76,7 +76,7 @@ def one(_: Wish) -> float:
 # Never more -------------------------------------------------------------------------------------
 
 
-@examples(200)
+@examples(100)
 @given(st.floats(1.0, 1000.0), SHARES, WISHES)
 def test_no_window_holds_more_bytes_than_allowed(
     bytes_per_s: float, share: float, wishes: list[Wish]
@@ -111,7 +111,7 @@ def test_a_small_budget_has_a_longer_window(
     assert bytes_window(bytes_per_s) == pytest.approx((most, window_s))
 
 
-@examples(200)
+@examples(100)
 @given(st.floats(50.0, 1000.0), WISHES)
 def test_from_50_bytes_a_second_on_the_window_is_10_s(
     bytes_per_s: float, wishes: list[Wish]
@@ -120,7 +120,7 @@ def test_from_50_bytes_a_second_on_the_window_is_10_s(
     assert most_within(10.0, sent, size_of) <= 10.0 * bytes_per_s + 1e-6
 
 
-@examples(200)
+@examples(100)
 @given(st.floats(0.1, 60.0), SHARES, wishes_with_gaps(20 * SECOND))
 def test_no_window_holds_more_messages_than_allowed(
     per_minute: float, share: float, wishes: list[Wish]
@@ -147,7 +147,7 @@ def test_of_two_and_a_half_messages_a_minute_three_come_in_72_s() -> None:
     assert stamps == [0, 0, 0, 72, 72, 72, 144, 144, 144]
 
 
-@examples(200)
+@examples(100)
 @given(st.floats(0.001, 5.0), SHARES, WISHES, st.lists(st.integers(0, 200), max_size=3))
 def test_a_match_never_costs_more_than_was_earned_whatever_was_restarted(
     rate_hz: float, share: float, wishes: list[Wish], restarts_s: list[int]
@@ -161,7 +161,7 @@ def test_a_match_never_costs_more_than_was_earned_whatever_was_restarted(
         assert number <= rate_hz * wish.at_ns * 1e-9 + 1e-6
 
 
-@examples(200)
+@examples(100)
 @given(st.floats(50.0, 500.0), st.integers(1, 30), WISHES, st.integers(0, 100 * SECOND))
 def test_no_window_holds_more_after_a_restart_either(
     bytes_per_s: float, per_minute: int, wishes: list[Wish], restart_ns: int
@@ -199,7 +199,7 @@ def test_what_is_taken_back_can_be_spent_again() -> None:
 # The reserve ------------------------------------------------------------------------------------
 
 
-@examples(200)
+@examples(100)
 @given(SHARES, WISHES)
 def test_the_reserve_is_there_for_what_is_urgent_and_only_for_that(
     share: float, wishes: list[Wish]
@@ -351,7 +351,7 @@ def test_the_interval_spends_the_budget_on_what_waited_longest(
 # What is reported -------------------------------------------------------------------------------
 
 
-@examples(200)
+@examples(100)
 @given(st.floats(1.0, 1000.0), st.floats(0.1, 60.0), st.floats(0.001, 5.0), WISHES)
 def test_spending_contains_the_largest_use_of_each_limit(
     bytes_per_s: float, per_minute: float, match_hz: float, wishes: list[Wish]

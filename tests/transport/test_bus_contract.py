@@ -360,13 +360,13 @@ def patterns_and_keys(draw: st.DrawFn) -> tuple[str, str]:
     return pattern, "/".join(key)
 
 
-@examples(200)
+@examples(100)
 @given(patterns_and_keys())
 def test_a_key_that_is_made_from_a_pattern_matches_it(made: tuple[str, str]) -> None:
     assert matches(*made)
 
 
-@examples(500)
+@examples(100)
 @given(PATTERN, st.lists(CHUNK, min_size=1, max_size=4).map("/".join))
 def test_the_bus_in_memory_reads_keys_as_zenoh_does(pattern: str, key: str) -> None:
     assert matches(pattern, key) is zenoh.KeyExpr(pattern).includes(zenoh.KeyExpr(key))

@@ -145,7 +145,7 @@ def test_a_worked_example_of_a_heading() -> None:
     assert again.heading_observer_variance == pytest.approx(1e-12, rel=0.003)
 
 
-@examples(300)
+@examples(150)
 @given(FIXES | BELIEFS | LANDMARKS)
 def test_rounding_costs_less_than_one_percent_of_sigma(message: Help) -> None:
     again = there_and_back(message)
@@ -170,7 +170,7 @@ def test_rounding_costs_less_than_one_percent_of_sigma(message: Help) -> None:
 TINY = st.floats(-12.0, 3.0).map(lambda power: 10.0**power) | st.just(0.0)
 
 
-@examples(300)
+@examples(150)
 @example((10.0, 1e-7, 10.0), (1.0, 0.0, 1e-8))  # thinner than double precision
 @given(st.tuples(TINY, TINY, TINY), st.tuples(ANGLES, ANGLES, ANGLES))
 def test_no_covariance_however_thin_comes_back_smaller(

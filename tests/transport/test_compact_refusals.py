@@ -205,7 +205,7 @@ def assert_usable(read: Help | Refusal) -> None:
         assert read.heading_sensor_variance > 0.0 < read.heading_observer_variance
 
 
-@examples(500)
+@examples(100)
 @given(st.binary(max_size=60))
 def test_random_bytes_never_raise(noise: bytes) -> None:
     for key in (FIX_KEY, BELIEF_KEY, LANDMARK_KEY):
@@ -213,7 +213,7 @@ def test_random_bytes_never_raise(noise: bytes) -> None:
         assert_usable(decode_help(key, bytes([VERSION]) + noise))
 
 
-@examples(500)
+@examples(100)
 @given(
     st.binary(min_size=FIX_BYTES - 1, max_size=FIX_BYTES - 1).map(lambda b: (FIX_KEY, b))
     | st.binary(min_size=HEADED_FIX_BYTES - 1, max_size=HEADED_FIX_BYTES - 1).map(
@@ -231,7 +231,7 @@ def test_any_bytes_of_the_right_length_are_a_gaussian(keyed: tuple[str, bytes]) 
     assert_usable(read)
 
 
-@examples(300)
+@examples(150)
 @given(FIXES | BELIEFS | LANDMARKS, st.data())
 def test_a_flipped_bit_never_raises(message: Help, data: st.DataObject) -> None:
     payload = bytearray(encode_help(message))
@@ -240,7 +240,7 @@ def test_a_flipped_bit_never_raises(message: Help, data: st.DataObject) -> None:
     assert_usable(decode_help(key_of(message), bytes(payload)))
 
 
-@examples(300)
+@examples(150)
 @given(st.from_regex(NAME_PATTERN, fullmatch=True) | st.text(max_size=40))
 def test_a_belief_is_read_under_the_key_of_a_robot_and_no_other(name: str) -> None:
     read = decode_help(f"belief/3/{name}", encode_help(BELIEF))

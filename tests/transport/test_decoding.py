@@ -94,7 +94,7 @@ def test_what_it_does_not_allow_is_refused(key: str, message: Tagged, reason: Re
 
 
 @given(st.sampled_from(sorted(GOOD)), st.binary(max_size=300))
-@examples(300)
+@examples(150)
 def test_anything_is_a_message_or_a_reason(key: str, payload: bytes) -> None:
     assert isinstance(decode(key, payload), Refusal | type(GOOD[key]))
 

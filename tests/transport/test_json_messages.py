@@ -124,7 +124,7 @@ KNOWN = st.sampled_from(
 OBJECTS = st.dictionaries(KNOWN | st.text(max_size=8), TREES, max_size=6)
 
 
-@examples(300)
+@examples(150)
 @given(OBJECTS, st.sampled_from(topics.INPUTS), st.binary(max_size=4), st.integers(0, 200))
 def test_any_json_is_a_message_or_a_reason(
     tree: dict[str, Any], topic: topics.Topic, noise: bytes, cut: int

@@ -165,7 +165,7 @@ def test_worked_examples_of_batches(batch: str, kind: Kind) -> None:
 TIMED = st.lists(st.tuples(st.integers(0, 50), st.integers(0, 9)), max_size=20)
 
 
-@examples(200)
+@examples(100)
 @given(TIMED, st.integers(1, 20))
 def test_the_fullest_window_is_found(timed: list[tuple[int, int]], window: int) -> None:
     batches = [Batch(float(t), Kind.DATA, bytes(n)) for t, n in sorted(timed)]

@@ -50,7 +50,7 @@ def indices(
     return index, kept
 
 
-@examples(200)
+@examples(100)
 @given(indices(PATTERN, by_itself), KEY)
 def test_a_key_finds_the_patterns_that_include_it(
     made: tuple[PatternIndex[Kept], list[Kept]], key: str
@@ -59,7 +59,7 @@ def test_a_key_finds_the_patterns_that_include_it(
     assert index.find(patterns_of(key)) == [k for k in kept if matches(k.keys, key)]
 
 
-@examples(200)
+@examples(100)
 @given(indices(KEY, patterns_of), PATTERN)
 def test_a_pattern_finds_the_keys_that_it_includes(
     made: tuple[PatternIndex[Kept], list[Kept]], pattern: str

@@ -81,7 +81,7 @@ def _cluster(address: str) -> "Iterator[Client]":
     if address.startswith("tls://") and not _has_certificate():
         raise InputError(f"--cluster {address}: {NO_CERTIFICATE}")
     try:
-        client = Client(address, timeout=ANSWER_S, set_as_default=False)  # type: ignore[no-untyped-call]
+        client = Client(address, timeout=ANSWER_S, set_as_default=False)
     except (OSError, TypeError, ValueError, ImportError) as error:
         why = str(error).partition("\n")[0] or type(error).__name__
         raise InputError(f"--cluster {address}: no Dask scheduler answers there: {why}") from error
@@ -106,7 +106,7 @@ def _workers_problem(client: "Client") -> str:
         "NumPy": (metadata.version, "numpy"),
         "its sources": (program_version,),
     }
-    if not client.nthreads():  # type: ignore[no-untyped-call]
+    if not client.nthreads():
         return "its scheduler has no workers; start some with `dask worker`"
     for what, (ask, *argument) in own.items():
         here = ask(*argument)
@@ -132,14 +132,14 @@ def _run_on_cluster(
     try:
         while left:
             try:
-                finished, left = wait(left, timeout=LOOK_S, return_when="FIRST_COMPLETED")  # type: ignore[no-untyped-call]
+                finished, left = wait(left, timeout=LOOK_S, return_when="FIRST_COMPLETED")
             except TimeoutError:
-                if not client.nthreads():  # type: ignore[no-untyped-call]
+                if not client.nthreads():
                     raise InputError(f"{option}: all its workers are gone") from None
                 continue
             for _ in finished:
                 progress()
-        results: list[Result] = client.gather(futures)  # type: ignore[no-untyped-call]
+        results: list[Result] = client.gather(futures)
     except KilledWorker as error:
         raise InputError(f"{option}: one run ended several workers: {error}") from error
     except CancelledError as error:

@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
+from support.sweeps import sampled
 
 from cpcbl_agents.vision.camera_correction import CameraCorrection
 from cpcbl_team.camera_errors import NO_ERRORS, CameraErrors, without_errors
@@ -139,7 +140,7 @@ def test_a_longer_lens_makes_things_look_nearer_and_wider_apart() -> None:
     assert read.bearing_rad == pytest.approx(math.atan2(1.0, 2.0 / 1.1))
 
 
-@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("seed", sampled(range(2), [0]))
 @pytest.mark.parametrize(
     "drive",
     [
@@ -250,7 +251,7 @@ def test_a_narrow_view_does_not_tell_the_yaw_from_the_principal_point(errors: Ca
 
 
 @pytest.mark.parametrize("errors", [YAW, CENTRE, CameraErrors(-YAW.yaw_rad, 0.0, 0.05)], ids=str)
-@pytest.mark.parametrize("half_view_deg", [6.0, 10.0, 15.0, 39.0])
+@pytest.mark.parametrize("half_view_deg", sampled([6.0, 10.0, 15.0, 39.0], [10.0, 39.0]))
 def test_what_is_named_is_never_the_wrong_one(errors: CameraErrors, half_view_deg: float) -> None:
     for seed in range(2):
         correction, _ = run(Drive(errors, half_view_deg=half_view_deg, seconds=60.0), seed)

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 from support.cameras import calibrated
 from support.markers import SIDES, seen_at
+from support.sweeps import thorough
 
 from cpcbl_agents.vision.camera import Camera, Floats
 from cpcbl_agents.vision.markers import sighting
@@ -67,7 +68,8 @@ def test_exact_corners_tell_the_pose(
 
 
 @pytest.mark.parametrize(
-    ("range_m", "turn_deg"), [(1.0, 35.0), (2.0, 10.0), (2.0, 50.0), (3.5, 30.0)]
+    ("range_m", "turn_deg"),
+    [thorough(1.0, 35.0), (2.0, 10.0), thorough(2.0, 50.0), (3.5, 30.0)],
 )
 def test_three_sigma_hold_what_noise_does(range_m: float, turn_deg: float) -> None:
     settings = replace(

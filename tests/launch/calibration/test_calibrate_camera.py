@@ -373,7 +373,10 @@ def test_json_and_boards_and_what_is_wrong(folder: Path, tmp_path: Path) -> None
         (["camera"], "name pictures of the board"),
         (["camera", folder, "--output", tmp_path / "t.toml"], "--output: name the team"),
         (["camera", tmp_path / "no.toml", folder, "--robot", "a"], "no.toml: no such file"),
-        (["camera", folder, "--board", "chessboard", "--squares", "9x9"], "no board found in any"),
+        (
+            ["camera", folder / "00.png", "--board", "chessboard", "--squares", "9x9"],
+            "no board found in any",
+        ),
     ):
         failed = command_line("calibrate", *arguments)
         assert failed.returncode == 2

@@ -116,7 +116,7 @@ def test_a_recorded_team_is_written_as_it_was(recorded: Path) -> None:
 def test_calibrate_prints_writes_and_draws(tmp_path: Path) -> None:
     type_text, picture = tmp_path / "calibrated.toml", tmp_path / "residuals.png"
     path = tmp_path / "trio.mcap"
-    simulate_recorded(TEAM, 1, 30.0, path)
+    simulate_recorded(TEAM, 1, 20.0, path)
     ran = command_line("calibrate", path, "--output", type_text, "--picture", picture)
     assert ran.returncode == 0, ran.stderr
     assert max(len(line) for line in ran.stdout.splitlines()[:-1]) <= 80  # last: a path

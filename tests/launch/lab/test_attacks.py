@@ -99,6 +99,7 @@ def test_a_guest_of_ever_new_names_leads_nobody_astray_beside_one_correct_observ
     assert row.false_quarantines == 0
 
 
+@pytest.mark.thorough
 def test_those_who_echo_its_own_pose_lead_no_robot_with_eyes_astray() -> None:
     """They kept the estimate back along an axis that the present landmark did not measure, faster
     than the means of some seconds could tell: both correct observers came into quarantine."""

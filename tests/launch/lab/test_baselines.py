@@ -20,6 +20,7 @@ from support.noisy_logs import (
     with_start_poses,
 )
 from support.processes import command_line
+from support.sweeps import thorough
 
 from cpcbl_launch.lab.baselines import baseline_inputs
 from cpcbl_launch.lab.evaluation import (
@@ -67,10 +68,13 @@ def test_without_noise_there_is_no_error(tmp_path: Path, blind: list[str]) -> No
             assert robot.inside_3_sigma == 1.0
 
 
-@pytest.fixture(scope="module")
-def runs(tmp_path_factory: pytest.TempPathFactory) -> list[dict[str, BaselineReport]]:
-    """Five noisy logs."""
-    return [reports_of(noisy_log(tmp_path_factory.mktemp("log"), seed, 25.0)) for seed in range(5)]
+@pytest.fixture(scope="module", params=[2, thorough(5)])
+def runs(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> list[dict[str, BaselineReport]]:
+    """So many noisy logs."""
+    seeds = range(request.param)
+    return [reports_of(noisy_log(tmp_path_factory.mktemp("log"), seed, 25.0)) for seed in seeds]
 
 
 def test_more_information_gives_a_smaller_error(runs: list[dict[str, BaselineReport]]) -> None:

@@ -70,7 +70,7 @@ def distrust_without_liars(
     ("shape", "seed"),
     [
         pytest.param("three observers", 1, marks=pytest.mark.thorough),
-        ("biased sensors", 2),
+        pytest.param("biased sensors", 2, marks=pytest.mark.thorough),
     ],
 )
 def test_no_correct_robot_is_quarantined_in_two_runs(shape: str, seed: int) -> None:

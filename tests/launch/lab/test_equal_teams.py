@@ -55,7 +55,7 @@ def test_information_that_circulates_between_two_robots_is_used_once(
     [
         pytest.param(SPLIT, True, marks=pytest.mark.thorough),
         (MUTUAL, True),
-        (MUTUAL_NAIVE, False),
+        pytest.param(MUTUAL_NAIVE, False, marks=pytest.mark.thorough),
     ],
 )
 def test_standing_robots_that_see_only_each_other_know_no_more_than_all_starts_together(

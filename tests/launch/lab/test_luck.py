@@ -71,7 +71,7 @@ def test_the_digest_does_not_depend_on_the_hash_seed() -> None:
     assert len(digests) == 1
 
 
-@pytest.mark.parametrize("bug", sampled(FOUND, ["ordering", "late data", "budget leak"]))
+@pytest.mark.parametrize("bug", sampled(FOUND, ["ordering"]))
 def test_a_planted_bug_is_found(bug: str) -> None:
     invariant, seed = FOUND[bug]
     with planted(bug):

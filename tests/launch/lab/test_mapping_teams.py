@@ -3,7 +3,7 @@
 import math
 
 import pytest
-from support.sweeps import over_seeds, sampled
+from support.sweeps import over_seeds
 
 from cpcbl_launch.lab.experiments.mapping import MappingRun, cases, row, run_mapping
 from cpcbl_launch.lab.experiments.worlds import WorldRun
@@ -12,8 +12,8 @@ GOOD = WorldRun(rmse_m=0.3, nees=2.0, heading_nees=1.0, inside_3_sigma=0.99, los
 RUN = MappingRun(GOOD, surveyed_rmse_m=0.1, place_nees=2.0, bytes_sent=70)
 
 
-@over_seeds(1, 12, more=2)
-@pytest.mark.parametrize("gives", sampled(["both", "range", "bearing"], ["bearing"]))
+@over_seeds(0, 12, more=2)
+@pytest.mark.parametrize("gives", ["both", "range", "bearing"])
 def test_a_robot_that_finds_all_landmarks_knows_how_far_it_errs(gives: str, seeds: range) -> None:
     key = ("a", "a", gives)
     found = row(key, [run_mapping(cases()[key], 1 + seed) for seed in seeds])

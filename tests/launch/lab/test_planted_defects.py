@@ -42,21 +42,16 @@ def take_late_fixes_for_new(agent: FilterAgent, item: Input) -> bool:
     return _add(agent, item)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("seed", SEEDS)
-@pytest.mark.parametrize(
-    "world",
-    [
-        pytest.param(rumour, marks=pytest.mark.thorough),
-        late_help,
-        pytest.param(overconfident_liar, marks=pytest.mark.thorough),
-    ],
-)
+@pytest.mark.parametrize("world", [rumour, late_help, overconfident_liar])
 def test_with_all_rules_the_stated_uncertainties_hold(
     world: Callable[[], World], seed: int
 ) -> None:
     assert not unmet_checks(verdict(world(), seed))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("seed", SEEDS)
 def test_naive_merging_is_noticed(seed: int) -> None:
     assert NEES in unmet_checks(verdict(rumour(), seed, merged_naively))
@@ -72,6 +67,7 @@ def test_late_help_that_is_taken_for_new_is_noticed(
     assert unmet >= ({RMSE, NEES} if seed < 3 else {RMSE})
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("seed", SEEDS)
 def test_a_team_without_trust_is_noticed(seed: int) -> None:
     assert NEES in unmet_checks(verdict(overconfident_liar(), seed, without_trust))

@@ -66,7 +66,7 @@ def cluster(
             stack.enter_context(dask(*worker, path=path, settings=settings)) for path in paths
         ]
         address = str(json.loads(file.read_text())["address"])
-        with Client(address, set_as_default=False) as client:  # type: ignore[no-untyped-call]
+        with Client(address, set_as_default=False) as client:
             client.wait_for_workers(len(paths), timeout=60)
         yield address, workers
 

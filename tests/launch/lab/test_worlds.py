@@ -40,13 +40,7 @@ QUICK = (  # the worlds of the findings, each as short as it may be
     "uncertain map, 2 landmarks",
     "unsurveyed, 0 of 8 known",
 )
-ALWAYS = (
-    "1 landmark bearing-only",
-    "50% of odometry lost, 4 landmarks",
-    "carried away, 2 landmarks",
-    "helper with heading σ 20 deg",
-    "uncertain map, 2 landmarks",
-)
+ALWAYS = ("uncertain map, 2 landmarks",)
 
 
 @pytest.mark.parametrize(

@@ -19,7 +19,7 @@ QUICK = (
     ("mirrored", "surveyed", "both"),
     ("in feet", "surveyed", "both"),
 )
-ALWAYS = (QUICK[0], QUICK[4])
+ALWAYS = (QUICK[0],)
 LONG = ("in centimetres", "surveyed", "both")
 
 

@@ -7,6 +7,7 @@ import pytest
 from msgspec.structs import replace
 from support.mapped_worlds import errors_of
 from support.mapping_worlds import World, make_world
+from support.sweeps import thorough
 
 from cpcbl_launch.mapping.command import KnownPlaces, known_places
 from cpcbl_launch.mapping.first_estimate import Request
@@ -24,7 +25,8 @@ def mapped_world(world: World, known: tuple[str, ...] = KNOWN, start: str = "") 
 
 
 @pytest.mark.parametrize(
-    ("robots", "days", "blind"), [(1, 1, ()), (2, 2, ()), (2, 1, ("r2",)), (5, 1, BLIND)]
+    ("robots", "days", "blind"),
+    [thorough(1, 1, ()), (2, 2, ()), thorough(2, 1, ("r2",)), (5, 1, BLIND)],
 )
 def test_without_noise_there_is_no_error(robots: int, days: int, blind: tuple[str, ...]) -> None:
     world = make_world(robots=robots, days=days, blind=blind, noise=0.0, seconds=40.0)
@@ -41,7 +43,9 @@ def test_without_noise_there_is_no_error(robots: int, days: int, blind: tuple[st
     assert mapped.notes == ()
 
 
-@pytest.mark.parametrize(("robots", "blind"), [(1, ()), (2, ()), (5, ()), (5, BLIND)])
+@pytest.mark.parametrize(
+    ("robots", "blind"), [thorough(1, ()), (2, ()), thorough(5, ()), thorough(5, BLIND)]
+)
 def test_the_covariance_is_consistent(robots: int, blind: tuple[str, ...]) -> None:
     """Over 16 to 32 degrees of freedom: the 99.9 % bounds of 24 are 0.35 and 2.1."""
     seeds = range(2 if robots == 5 else 4)

@@ -8,6 +8,7 @@ import pytest
 from msgspec.structs import replace
 from support.mapped_worlds import Errors, errors_of, exact_walls, moved, rough_landmarks
 from support.mapping_worlds import MARKS, ROOM, make_world
+from support.sweeps import thorough
 
 from cpcbl_launch.mapping.command import known_places
 from cpcbl_launch.mapping.first_estimate import Request
@@ -102,18 +103,18 @@ def _swapped() -> Request:
             r"landmark desk is not where .* \(desk by 0\.1\d m, \d+ σ\): its place is not used",
             set(MARKS) - {"desk"},
         ),
-        (
+        thorough(
             lambda: _request(desk=0.15, pole=-0.15),
             r"landmark pole is not where",
             {*KNOWN, "rack", "sofa"},
         ),
-        (
+        thorough(
             lambda: _pair(0.25),
             r"places of door, lamp contradict each other.*they are used all the same",
             set(KNOWN),
         ),
         (lambda: _pair(0.6), r"places of door, lamp contradict.*none of these is used", set()),
-        (lambda: _request(), "no place is new", set(MARKS)),
+        thorough(lambda: _request(), "no place is new", set(MARKS)),
     ],
 )
 def test_surveyed_landmarks_that_contradict_each_other_are_named(

@@ -1,6 +1,5 @@
 """Pictures of runs: what is drawn of a run with or without truth, and of unusual ones."""
 
-import io
 import math
 from collections.abc import Callable, Mapping
 from typing import NamedTuple
@@ -81,10 +80,10 @@ class World:
         guests_s: Mapping[str, list[tuple[float, float]]] | None = None,
         duration_s: float = DURATION_S,
     ) -> Figure:
-        """Drawn as into a file, so that what only drawing shows is shown."""
+        """Laid out and drawn, so that what only drawing shows is shown."""
         times = Times(BEGIN_S, duration_s, None, guests_s or {})
         figure = run_figure(self.recorder, team, truth or {}, times)
-        figure.savefig(io.BytesIO(), format="svg")
+        figure.draw_without_rendering()
         return figure
 
 

@@ -170,8 +170,8 @@ def hidden(team: Team, robots: Sequence[str], seed: int, blind_s: float) -> None
 
 
 def test_sigma_grows_honestly_while_all_landmarks_are_hidden() -> None:
-    event = SimulationEvent(at_s=AT_S, hide_landmarks_s=60.0)
-    hidden(demo(event, without="observer"), ("navigator", "patrol", "scout"), 1, 60.0)
+    event = SimulationEvent(at_s=AT_S, hide_landmarks_s=40.0)
+    hidden(demo(event, without="observer"), ("navigator", "patrol", "scout"), 1, 40.0)
 
 
 @pytest.mark.long

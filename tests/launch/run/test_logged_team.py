@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 from support.logs import EPOCH_MS, LANDMARKS, STARTS, STEP_MS, log_team, write_log
+from support.sweeps import thorough
 
 from cpcbl_agents.robot_state import miscalibration_text
 from cpcbl_agents.sources.mrclam import LogError
@@ -183,7 +184,7 @@ def test_choices_are_made_for_all_robots_and_nothing_else() -> None:
 
 @pytest.mark.parametrize(
     "options",
-    [{}, {"recovered": ALL}, {"backwards": True}, {"unknown_barcode": True}],
+    [{}, *map(thorough, ({"recovered": ALL}, {"backwards": True}, {"unknown_barcode": True}))],
     ids=["plain", "recovered truth", "backwards stamps", "unknown barcode"],
 )
 @pytest.mark.parametrize(

@@ -142,16 +142,20 @@ def test_every_preset_can_join() -> None:
 
 
 def visited(
-    seed: int, *wishes: ObserverRequest, from_s: float = 20.0, until_s: float = 40.0
+    seed: int,
+    *wishes: ObserverRequest,
+    from_s: float = 20.0,
+    until_s: float = 40.0,
+    duration_s: float = 60.0,
 ) -> Recorder:
-    """The blind team for a minute, with guests in the middle of it."""
+    """The blind team for so long, with guests in the middle of it."""
     guests = [
         ScheduledGuest(
             wish.name, team_with_observer(BLIND, wish).robots[wish.name], from_s, until_s
         )
         for wish in wishes
     ]
-    return simulate_with_guests(BLIND, seed, 60.0, guests)
+    return simulate_with_guests(BLIND, seed, duration_s, guests)
 
 
 def team_rmse_m(recorder: Recorder, span: Span) -> float:
@@ -165,7 +169,7 @@ THERE, GONE = Span(21.0, 40.0), Span(50.0, 60.0)
 
 @cache
 def rmse_without_guest_m(seed: int) -> float:
-    return team_rmse_m(visited(seed), THERE)
+    return team_rmse_m(visited(seed, duration_s=THERE.until_s), THERE)
 
 
 @pytest.mark.parametrize(

@@ -133,10 +133,14 @@ def team3(tmp_path: Path) -> Team3:
 def test_an_observer_joins_a_running_team_and_leaves_it(
     team3: Team3, number: signal.Signals
 ) -> None:
+    """Another one of the same name is not let in meanwhile."""
     gone: list[int] = []
 
+    def second_is_over(recorder: Recorder) -> bool:
+        return team3.observers[1].poll() is not None
+
     def leaves(recorder: Recorder) -> bool:
-        (process,) = team3.observers
+        process = team3.observers[0]
         process.send_signal(number)
         gone.append(process.wait(timeout=PATIENCE_S))
         return True
@@ -145,6 +149,8 @@ def test_an_observer_joins_a_running_team_and_leaves_it(
         team3.all_lose_their_way,
         lambda recorder: team3.observe(),
         team3.all_know_their_place,
+        lambda recorder: team3.observe(),
+        second_is_over,
         team3.guest_stays,
         leaves,
         team3.guest_has_left,
@@ -152,7 +158,9 @@ def test_an_observer_joins_a_running_team_and_leaves_it(
         lambda recorder: "tripod" not in recorder.latest()[2],
     )
     assert gone == [{signal.SIGKILL: -number, signal.SIGINT: 130}.get(number, 0)]
-    ((said, _),) = team3.said
+    (said, _), (_, refused) = team3.said
+    assert team3.observers[1].returncode == 2
+    assert "the team has one of this name" in refused
     assert "tripod joins team blind" in said
     if number is not signal.SIGKILL:
         assert "tripod took part for" in said
@@ -228,21 +236,6 @@ def test_after_its_time_an_observer_leaves_and_says_what_it_did(team3: Team3) ->
     assert said["lost"] == said["unfed"] == ""
     assert {flow["peer"] for flow in said["sent"] if flow["topic"] == "fix"} >= {"r1"}
     assert said["counts"]["sightings"] > 20
-
-
-def test_two_of_one_name_are_not_let_in(team3: Team3) -> None:
-    def second_is_over(recorder: Recorder) -> bool:
-        return team3.observers[1].poll() is not None
-
-    team3.run(
-        team3.all_lose_their_way,
-        lambda recorder: team3.observe(),
-        team3.all_know_their_place,
-        lambda recorder: team3.observe(),
-        second_is_over,
-    )
-    assert team3.observers[1].returncode == 2
-    assert "the team has one of this name" in team3.said[1][1]
 
 
 @pytest.mark.thorough

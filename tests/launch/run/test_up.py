@@ -65,6 +65,7 @@ def run(script: Script, team: Team, folder: Path, limit_s: float = 60.0) -> Repo
     return report
 
 
+@pytest.mark.thorough  # `make chaos` does it as well
 def test_kills_one_of_four_robot_processes_and_it_localizes_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

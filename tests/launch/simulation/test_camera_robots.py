@@ -233,6 +233,7 @@ def test_tiles_and_a_teammate_that_fell_over_end_no_robot(tmp_path: Path) -> Non
         assert robot.counted("odometry", before["odometry"] + 5)
 
 
+@pytest.mark.thorough
 def test_tiles_and_a_teammate_that_fell_over_restart_no_process_of_a_team(tmp_path: Path) -> None:
     (tmp_path / "frames").mkdir()
     for n, image in enumerate(hostile_frames()):

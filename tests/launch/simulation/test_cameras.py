@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 from support.buses import MS, SECOND, Subscription
+from support.sweeps import thorough
 
 from cpcbl_agents.extras import install_command
 from cpcbl_agents.vision.camera import Camera, Pixels
@@ -203,10 +204,10 @@ def without_opencv(code: str) -> "subprocess.CompletedProcess[str]":
 @pytest.mark.parametrize(
     "arguments",
     [
-        ["simulate", "FILE", "--duration", "1"],
+        thorough(["simulate", "FILE", "--duration", "1"]),
         ["up", "FILE", "--duration", "1"],
         ["robot", "FILE", "eye"],
-        ["field", "FILE"],
+        thorough(["field", "FILE"]),
     ],
 )
 def test_without_opencv_one_line_says_what_to_install(arguments: list[str], tmp_path: Path) -> None:

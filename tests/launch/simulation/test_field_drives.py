@@ -75,9 +75,7 @@ EXACT_ODOMETRY = OdometrySettings(
     ids=["range", "bearing", "range and bearing"],
 )
 @pytest.mark.parametrize("odometry", [OdometrySettings(), EXACT_ODOMETRY], ids=["usual", "exact"])
-@pytest.mark.parametrize(
-    "variant", sampled(["joint", "oval", "circular", "weighted"], ["joint", "weighted"])
-)
+@pytest.mark.parametrize("variant", sampled(["joint", "oval", "circular", "weighted"], ["joint"]))
 @pytest.mark.parametrize("duration_s", [8.0, pytest.param(20.0, marks=pytest.mark.long)])
 def test_a_sensor_that_never_errs_stops_no_robot(
     sensor: dict[str, Any], odometry: OdometrySettings, variant: Variant, duration_s: float
@@ -118,7 +116,7 @@ def test_a_position_sensor_keeps_a_robot_that_sees_nothing_on_its_way(delay_s: f
         ),
     }
     believed = Team(name="t", robots=robots)
-    report, _ = simulate(believed, 2, 60.0)
+    report, _ = simulate(believed, 2, 40.0)
     with_gps = report.robots["with_gps"]
     assert with_gps.position_rmse_m is not None
     assert with_gps.position_rmse_m < 0.05
@@ -131,7 +129,7 @@ def test_a_position_sensor_keeps_a_robot_that_sees_nothing_on_its_way(delay_s: f
         prompt = msgspec.structs.replace(sensor, delay_s=0.0)
         unaware = msgspec.structs.replace(robots["with_gps"], position_sensor=prompt)
         other = msgspec.structs.replace(believed, robots={**robots, "with_gps": unaware})
-        wrong, _ = simulate(other, 2, 60.0, truth=believed)
+        wrong, _ = simulate(other, 2, 40.0, truth=believed)
         misled = wrong.robots["with_gps"].position_rmse_m
         assert misled is not None
         assert misled > 1.5 * with_gps.position_rmse_m

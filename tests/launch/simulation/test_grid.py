@@ -19,7 +19,7 @@ COORDINATE = st.integers(-40, 40).map(float) | st.floats(-40.0, 40.0)
 PLACE = st.tuples(COORDINATE, COORDINATE)
 
 
-@examples(200)
+@examples(100)
 @given(st.lists(PLACE, max_size=30), PLACE, st.sampled_from([0.0, 0.15, 1.0, 6.0, 1e6]))
 def test_all_within_reach_are_found_in_their_order(
     places: list[tuple[float, float]], place: tuple[float, float], reach_m: float

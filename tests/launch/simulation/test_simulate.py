@@ -4,7 +4,7 @@ import json
 from pathlib import Path
 
 import pytest
-from support.processes import cpcbl_team
+from support.processes import command_line
 
 from cpcbl_launch.cli import main
 from cpcbl_launch.simulation.in_process import simulate
@@ -16,7 +16,7 @@ PNG = b"\x89PNG\r\n\x1a\n"
 def test_a_team_file_gives_the_report_of_up(tmp_path: Path) -> None:
     written, picture = tmp_path / "report.json", tmp_path / "run.png"
     options = ["--duration", 12, "--seed", 3, "--picture", picture, "--report", written]
-    ran = cpcbl_team("simulate", "demo", *options)
+    ran = command_line("simulate", "demo", *options)
     assert ran.returncode == 0, ran.stderr
     for word in ("before m", "navigator", "scout", "team", "NEES"):
         assert word in ran.stdout

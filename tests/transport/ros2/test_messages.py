@@ -33,7 +33,7 @@ JAZZY = TYPES[Distribution.JAZZY]
 @pytest.mark.parametrize("distribution", Distribution)
 def test_what_is_written_is_read(distribution: Distribution, name: str) -> None:
     types, rng = TYPES[distribution], random.Random(name)
-    for _ in range(20):
+    for _ in range(8):
         message = random_message(types, name, rng)
         payload = types.encode(message)
         assert payload[:4] == b"\0\1\0\0"
