@@ -25,9 +25,9 @@ NEARLY_KNOWN: Final = 0.2
 squared distance of an object, below which no more than the turn is uncertain."""
 
 BENT_SHARE: Final = 0.03
-"""The arc is used only if a reading bends along it: if the square of what a linear form leaves out
-within a sigma of the turn is more than this share of the reading's variance. Range and bearing to
-the landmark that an arc is about do not bend."""
+"""The arc is used only if a reading bends: if the square of what a linear form leaves out within a
+sigma of the turn along the arc, or of the offset, is more than this share of the reading's
+variance. Range and bearing to the landmark that an arc is about do not bend along it."""
 
 
 class Linearization(NamedTuple):
@@ -164,18 +164,19 @@ class Relinearization:
 
 
 def _is_bent(arc: Arc, measure: Measure) -> bool:
-    """Whether a reading bends along the arc, within a sigma of the turn."""
-    sigma = math.sqrt(arc.covariance.hh)
-    before, here, after = (measure(arc.at((0.0, 0.0, turn))) for turn in (-sigma, 0.0, sigma))
-    if not len(before) == len(here) == len(after):  # a pose on it touches the object
-        return True
-    for (_, first, _), (row, middle, variance), (_, last, _) in zip(
-        before, here, after, strict=True
-    ):
-        steps = first - middle, last - middle
-        bend = 0.5 * sum(map(wrap_angle, steps) if row[2] else steps)
-        if bend * bend > BENT_SHARE * variance:
+    """Whether a reading bends within a sigma of the turn along the arc, or of the offset."""
+    here, mean = measure(arc.pose), (0.0, 0.0, 0.0)
+    for axis in square_root(arc.covariance):
+        before, after = (measure(arc.at(row_sum(mean, axis, k))) for k in (-1.0, 1.0))
+        if not len(before) == len(here) == len(after):  # a pose on it touches the object
             return True
+        for (_, first, _), (row, middle, variance), (_, last, _) in zip(
+            before, here, after, strict=True
+        ):
+            steps = first - middle, last - middle
+            bend = 0.5 * sum(map(wrap_angle, steps) if row[2] else steps)
+            if bend * bend > BENT_SHARE * variance:
+                return True
     return False
 
 
