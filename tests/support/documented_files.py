@@ -64,7 +64,7 @@ def transport(endpoint: str) -> str:
 
 
 def _log(path: Path) -> None:
-    write_log(path, ("1", "2", "3", "4", "5"), seconds=3.0)
+    write_log(path, ("1", "2", "3", "4", "5"), seconds=6.0)
 
 
 def _shots(path: Path) -> None:
