@@ -141,11 +141,10 @@ class Relinearization:
         fit = best_fit(arc, lambda pose: [s for measure in accepted for s in measure(pose)])
         return None if fit is None else (_about(state, arc, fit.offset), Linearization(arc, fit))
 
-    def after_frame(self, prior: Estimate, estimate: Estimate) -> Estimate:
-        """The estimate after a frame that was linearized at the pose of its prior, with a
+    def after_frame(self, state: State, estimate: Estimate) -> Estimate:
+        """The estimate after a frame that was linearized at the pose of the state, with a
         covariance about its own pose."""
-        is_bent = self._rules.estimates_whole_pose and prior.covariance.hh > BENT_VARIANCE
-        return about_own_pose(estimate, prior.pose) if is_bent else estimate
+        return about_own_pose(estimate, state.estimate.pose) if self.is_due(state) else estimate
 
     def _measure(self, state: State, m: Measurement) -> Measure:
         """What an object says, with the errors of its place and of the camera as noise."""
