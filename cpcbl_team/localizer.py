@@ -126,7 +126,7 @@ class Localizer:
         if self._common is None:
             estimate = self.correct(prior, landmarks, gated, scope)
             if prior is before:  # else it is about the best pose on its arc
-                estimate = self._relinearization.after_frame(state, estimate)
+                estimate = self._relinearization.after_frame(state, gated.accepted, estimate)
         else:
             state, estimate = self._common.correct(state, gated.accepted)
         state = self._with_frame(state, estimate, landmarks, gated, scope)

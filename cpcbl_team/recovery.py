@@ -89,10 +89,9 @@ class Recovery:
         memory = state.memory.recovery
         limits = self._limits_when_lost if memory.lost else self._limits
         reason = lost_reason(state.estimate, state.updates.innovations, limits)
-        if memory.kidnapped_ns >= 0 and (not reason or state.updates.innovations & 1):
+        if memory.kidnapped_ns >= 0 and not reason:
             evidence = self.evidence(memory, state.memory.calibration.adaptation)
-            uses = state.updates.objects_ns
-            reason = undetermined(evidence, uses, memory.kidnapped_ns) or reason
+            reason = undetermined(evidence, state.updates.objects_ns, memory.kidnapped_ns)
         if reason:
             return self._recover(state, reason)
         if memory.lost:

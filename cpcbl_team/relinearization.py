@@ -6,7 +6,7 @@ that knows its heading.
 """
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Final, NamedTuple
 
 from cpcbl_team.arc_fit import ArcFit, Measure, Scalar, best_fit, least_cost
@@ -16,7 +16,7 @@ from cpcbl_team.config import LocalizationSettings, LocalizerSettings
 from cpcbl_team.constraints import TELLS_NOTHING, Constraint, curved_variance
 from cpcbl_team.estimate import POSE, ZERO3, Estimate, Row, dot, row_sum
 from cpcbl_team.geometry import Pose2, wrap_angle
-from cpcbl_team.measurements import Measurement, constraints_of
+from cpcbl_team.measurements import GatedObject, Measurement, constraints_of
 from cpcbl_team.state import State, with_common_errors
 
 BENT_VARIANCE: Final = math.radians(5.0) ** 2  # of the heading: above, tangents are no arcs
@@ -24,10 +24,10 @@ NEARLY_KNOWN: Final = 0.2
 """The ratio of the offset's variance to what the turn adds to that of the position, and to the
 squared distance of an object, below which no more than the turn is uncertain."""
 
-BENT_SHARE: Final = 0.03
-"""The arc is used only if a reading bends: if the square of what a linear form leaves out within a
-sigma of the turn along the arc, or of the offset, is more than this share of the reading's
-variance. Range and bearing to the landmark that an arc is about do not bend along it."""
+NONLINEAR_SHARE: Final = 0.03
+"""A reading is nonlinear if the square of what its linear form leaves out, within a sigma of the
+turn along the arc or of the offset, is more than this share of its variance. Range and bearing to
+the landmark that an arc is about are linear along it."""
 
 
 class Linearization(NamedTuple):
@@ -121,19 +121,19 @@ class Relinearization:
     ) -> tuple[State, Linearization | None] | None:
         """The state with its prior about the pose that fits the objects of the map best, and that
         pose; None if another pose fits nearly as well. The state as it is, and no pose, if its
-        estimate is no arc, if these objects leave none, or if none of their readings bends along
-        it: each fit also follows the noise of its frame, so many fits would make certainty of a
-        turn that nothing measures."""
+        estimate is no arc, if these objects leave none, or if all of their readings are linear:
+        each fit also follows the noise of its frame, so many fits would make certainty of a turn
+        that nothing measures."""
         if not self.is_due(state):
             return state, None
         arc, objects = Arc.of(state.estimate), [m for m in measurements if not m.sender]
         if not objects or not all(_leaves_arc(arc, m) for m in objects):
             return state, None
-        if not any(_is_bent(arc, self._measure(state, m)) for m in objects):
+        measures = [self._measure(state, m) for m in objects]
+        if not any(_is_nonlinear(arc, measure) for measure in measures):
             return state, None
         accepted: list[Measure] = []
-        for m in objects:
-            measure = self._measure(state, m)
+        for measure in measures:
             readings = len(measure(arc.pose))
             gate = self._gates[readings > 1]
             if readings and least_cost(arc, measure, gate) <= gate:
@@ -141,10 +141,15 @@ class Relinearization:
         fit = best_fit(arc, lambda pose: [s for measure in accepted for s in measure(pose)])
         return None if fit is None else (_about(state, arc, fit.offset), Linearization(arc, fit))
 
-    def after_frame(self, state: State, estimate: Estimate) -> Estimate:
-        """The estimate after a frame that was linearized at the pose of the state, with a
-        covariance about its own pose."""
-        return about_own_pose(estimate, state.estimate.pose) if self.is_due(state) else estimate
+    def after_frame(
+        self, state: State, accepted: Sequence[GatedObject], estimate: Estimate
+    ) -> Estimate:
+        """The estimate after a frame whose objects were linearized at the pose of the state; where
+        they may leave a turn about one of them undetermined, with a covariance about its own
+        pose."""
+        if not self.is_due(state) or not any(_leaves_a_turn(f.measurement) for f in accepted):
+            return estimate
+        return about_own_pose(estimate, state.estimate.pose)
 
     def _measure(self, state: State, m: Measurement) -> Measure:
         """What an object says, with the errors of its place and of the camera as noise."""
@@ -162,8 +167,8 @@ class Relinearization:
         return measure
 
 
-def _is_bent(arc: Arc, measure: Measure) -> bool:
-    """Whether a reading bends within a sigma of the turn along the arc, or of the offset."""
+def _is_nonlinear(arc: Arc, measure: Measure) -> bool:
+    """Whether a reading is nonlinear within a sigma of the turn along the arc, or of the offset."""
     here, mean = measure(arc.pose), (0.0, 0.0, 0.0)
     for axis in square_root(arc.covariance):
         before, after = (measure(arc.at(row_sum(mean, axis, k))) for k in (-1.0, 1.0))
@@ -173,17 +178,22 @@ def _is_bent(arc: Arc, measure: Measure) -> bool:
             before, here, after, strict=True
         ):
             steps = first - middle, last - middle
-            bend = 0.5 * sum(map(wrap_angle, steps) if row[2] else steps)
-            if bend * bend > BENT_SHARE * variance:
+            left_out = 0.5 * sum(map(wrap_angle, steps) if row[2] else steps)
+            if left_out * left_out > NONLINEAR_SHARE * variance:
                 return True
     return False
+
+
+def _leaves_a_turn(m: Measurement) -> bool:
+    """Whether an object leaves only a turn about it undetermined: range and bearing to a point."""
+    return m.range_m is not None and m.bearing is not None and m.wall is None
 
 
 def _leaves_arc(arc: Arc, m: Measurement) -> bool:
     """Whether the poses that agree with an object are an arc. Range and bearing to one point leave
     only a turn about that point undetermined, whatever the prior is. Other objects leave other
     curves if more than the turn is uncertain."""
-    if m.range_m is not None and m.bearing is not None and m.wall is None:
+    if _leaves_a_turn(m):
         return True
     xx, _, yy, _, _, hh = arc.covariance
     apart, by_turn = xx + yy, hh * (arc.x * arc.x + arc.y * arc.y)
