@@ -96,8 +96,8 @@ def with_arc_width(estimate: Estimate) -> Estimate:
 
 
 def lever_change(dx: float, dy: float) -> Matrix3:
-    """The matrix that expresses an error about a pose as one about a pose that is (dx, dy) from
-    there: an error of the heading turns the position about the origin, and so by this much more."""
+    """The matrix that an error (x, y, heading) is multiplied by when its pose moves by (dx, dy) and
+    it stays the same turn about the origin: that turn moves the position by (-dy, dx) more."""
     return 1.0, 0.0, -dy, 0.0, 1.0, dx, 0.0, 0.0, 1.0
 
 

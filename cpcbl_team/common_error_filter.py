@@ -265,6 +265,7 @@ class CommonErrorFilter:
         return with_common_errors(state, common), estimate
 
     def _bounded(self, common: CommonErrors) -> CommonErrors:
+        """Known errors, of which a bias of bearings is no larger than the settings allow."""
         if not common.is_of_bearings:
             return common
         return common.with_bias_below(MOST_SIGMAS * self.prior.camera_sigmas.yaw_rad)

@@ -149,10 +149,12 @@ class OwnPoses:
         return own if self._common is None else self._common.own_pose_for(own, state)
 
     def _new_own_pose(self, state: State) -> OwnPose:
-        calibration, estimate = state.memory.calibration, mark_shared(state.estimate)
-        place, gaps = state.odometry_from_robot, _gaps(state)
-        of_settings = calibration.adaptation, gaps, calibration.common
-        return OwnPose(state.stamp_ns, estimate, place, *of_settings)
+        """The pose by own sensors where it begins: the estimate."""
+        known = state.memory.calibration
+        estimate, place = mark_shared(state.estimate), state.odometry_from_robot
+        return OwnPose(
+            state.stamp_ns, estimate, place, known.adaptation, _gaps(state), known.common
+        )
 
 
 def misleading(

@@ -38,9 +38,7 @@ class OwnPose(NamedTuple):
     odometry_from_robot: Pose2  # dead reckoning at that time
     adaptation: Adaptation  # the settings with which it was found
     gaps: int  # of the odometry until then
-    common: CommonErrors | None = (
-        None  # what own sensors say of the errors that they have in common
-    )
+    common: CommonErrors | None = None  # what own sensors say of the errors in all their readings
 
     @property
     def is_known(self) -> bool:

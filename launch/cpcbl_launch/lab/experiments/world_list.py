@@ -8,7 +8,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from cpcbl_launch.calibration.between_days import ANOTHER_DAY
-from cpcbl_launch.lab.experiments.runs import with_settings
+from cpcbl_launch.lab.experiments.runs import circuit_team, with_settings
 from cpcbl_launch.team.file import builtin_path, load_team
 from cpcbl_launch.team.overrides import with_blind_robots
 from cpcbl_team.config import (
@@ -26,15 +26,10 @@ from cpcbl_team.config import (
 )
 
 DURATION_S = 40.0
-BAD_S = 65.0  # in which the heading of a robot with bad odometry becomes as uncertain as it will
+BAD_S = 65.0  # in which the heading of a robot with bad odometry becomes uncertain
 LEARNING_S = 60.0  # for a robot whose settings are wrong
 AWAY = SimulationEvent(at_s=10.0, kidnap="r", to=(5.5, 4.0, 200.0))
 ZIGZAG = ((3.0, 2.5), (3.4, 3.5), (3.8, 2.5), (4.2, 3.5), (4.6, 2.5), (4.2, 3.6))
-BAD_ODOMETRY = OdometrySettings(
-    distance_sigma_m_per_sqrt_m=0.15,
-    turn_sigma_rad_per_sqrt_rad=0.25,
-    turn_sigma_rad_per_sqrt_m=0.15,
-)
 KINDS = ("both", ""), ("range", " range-only"), ("bearing", " bearing-only")
 
 
@@ -138,10 +133,11 @@ def _bad_odometry_worlds() -> dict[str, World]:
     middle = Field(landmarks={"middle": Landmark(x_m=4.0, y_m=3.0)})
     fields = {_landmarks(count): _field(count) for count in (1, 2)}
     fields["1 landmark in the middle"] = middle
-    sensor = replace(all_robots().robots["a"].sensor, bearing_sigma_deg=5.0)
-    teams = {
-        text: _alone(field, odometry=BAD_ODOMETRY, sensor=sensor) for text, field in fields.items()
-    }
+    navigator = circuit_team(["navigator"]).robots["navigator"]
+    sigma_deg = navigator.sensor.bearing_sigma_deg
+    sensor = replace(all_robots().robots["a"].sensor, bearing_sigma_deg=sigma_deg)
+    bad = {"odometry": navigator.odometry, "sensor": sensor}
+    teams = {text: _alone(field, **bad) for text, field in fields.items()}
     return {
         f"bad odometry, {text}": World(t, ("r",), duration_s=BAD_S) for text, t in teams.items()
     }
