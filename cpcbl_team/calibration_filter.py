@@ -94,6 +94,7 @@ class CalibrationFilter(NamedTuple):
     probability: float = 0.0  # that the settings are wrong as it says (`calibration_doubt.py`)
     gaps: int = 0  # in the odometry, before the way on which it was led here
     scales: tuple[float, float] = (1.0, 1.0)  # by which the odometry was corrected then
+    jumped_ns: int = -1  # when the robot was last found elsewhere before this filter began
 
     @staticmethod
     def at(
@@ -225,6 +226,7 @@ class _Update:
         self._chi_squares, self._readings = before.chi_squares, before.readings
         self._used, self._metres, self._rejected = before.used, before.metres, before.rejected
         self._gaps, self._scales = before.gaps, before.scales
+        self._jumped_ns = before.jumped_ns
 
     def move(self, stamp_ns: int, place: Pose2, noise: OdometryNoise) -> None:
         """To where the odometry has led by this time: pose' = pose + arc(errors)."""
@@ -335,7 +337,7 @@ class _Update:
         parts = (
             self._stamp_ns, self._place, new(Pose2, (x, y, wrap_angle(heading))), tuple(errors),
             _tuples(self._rows), self._used_ns, self._chi_squares, self._readings, self._used,
-            self._metres, self._rejected, 0.0, self._gaps, self._scales,
+            self._metres, self._rejected, 0.0, self._gaps, self._scales, self._jumped_ns,
         )  # fmt: skip
         return new(CalibrationFilter, parts)
 

@@ -13,7 +13,7 @@ from typing import Final, NamedTuple
 from cpcbl_team.estimate import Estimate, FilteredOffset
 from cpcbl_team.geometry import Pose2
 from cpcbl_team.lost_reasons import no_longer_lost
-from cpcbl_team.relocalization import OUTLIER, PropagatedEvidence, readings_of
+from cpcbl_team.relocalization import OUTLIER, UNKNOWNS, PropagatedEvidence, readings_of
 from cpcbl_team.state import Evidence, RecoveryMemory, State
 from cpcbl_team.trusted_pose import LATEST_NS, agrees, expected_pose, explaining_mistake
 
@@ -88,6 +88,14 @@ def exchanged_objects(
     return frozenset(found.contradicting)
 
 
+def is_explained_by(
+    found: Estimate, evidence: Sequence[Evidence], odometry_from_robot: Pose2
+) -> bool:
+    """Whether a pose that was found leaves nothing of the robot's own evidence out."""
+    own = [e for e in evidence if not e.from_teammate]
+    return all(_chi_square(found, e, odometry_from_robot) < OUTLIER for e in own)
+
+
 def explains_as_well(
     known: Estimate, found: Estimate, evidence: Sequence[Evidence], odometry_from_robot: Pose2
 ) -> bool:
@@ -140,9 +148,15 @@ def kept_at_trusted_pose(
         return None
     if misplaced and not exchanged and explaining_mistake(state, memory, evidence, None):
         return None  # nothing can be said of objects before the driver is mended
+    is_elsewhere = found is not None and not agrees(known, found)
+    if misplaced and not exchanged and found is not None and is_elsewhere:
+        # Readings that determine no pose agree with others as well, and the map fits at one of them
+        is_determined = sum(map(readings_of, comparison.agreeing)) >= UNKNOWNS
+        if not is_determined and is_explained_by(found, evidence, place):
+            return None
     if not misplaced:
         latest = [e for e in evidence if e.stamp_ns >= state.stamp_ns - LATEST_NS]
-        if found is None or agrees(known, found):
+        if found is None or not is_elsewhere:
             return None
         if not explains_as_well(known, found, latest, place):
             return None

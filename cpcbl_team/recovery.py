@@ -62,6 +62,7 @@ DOUBT_NS: Final = 5_000_000_000  # wrong inputs are named before they move a rob
 QUESTION_NS: Final = 2_000_000_000  # a suspicious robot asks so often whether it is elsewhere
 SUSPICIOUS: Final = 2  # of the last innovations rejected; of 20 that is 2 in 10 000 times
 UNCONFIRMED: Final = 3  # of them, for a robot to which nothing can tell that it is where it was
+UNCONFIRMED_BY_TWO: Final = 9  # not reached by a sensor of twice its sigma before it is noticed
 
 
 class Recovery:
@@ -139,12 +140,15 @@ class Recovery:
 
     def _unconfirmed(self, state: State, since_ns: int) -> str:
         """Why nothing that a suspicious robot measures can confirm its pose: it has only ranges to
-        one object, which agree with any pose at that distance. Empty if something can."""
-        if rejected_of(state.updates.innovations)[0] < UNCONFIRMED:
+        one object, which agree with any pose at that distance, or to two, which agree with the
+        mirror image of its position and with any heading. Empty if something can."""
+        rejected, _ = rejected_of(state.updates.innovations)
+        if rejected < UNCONFIRMED:
             return ""
         evidence = self._evidence_since(state, since_ns)
         is_determined = any(e.bearing_rad is not None or e.range_m is None for e in evidence)
-        if is_determined or len({e.source for e in evidence}) != 1:
+        least = {1: UNCONFIRMED, 2: UNCONFIRMED_BY_TWO}.get(len({e.source for e in evidence}))
+        if is_determined or least is None or rejected < least:
             return ""
         return undetermined(evidence, state.updates.objects_ns, since_ns)
 

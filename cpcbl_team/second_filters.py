@@ -34,6 +34,7 @@ from cpcbl_team.rough_pose import rough_pose
 from cpcbl_team.scale_errors import EXACT, ScaleErrors
 from cpcbl_team.state import (
     Evidence,
+    Jump,
     State,
     at_new_pose,
     with_calibration,
@@ -43,6 +44,7 @@ from cpcbl_team.state import (
 
 MOST_BEGIN_M, MOST_BEGIN_RAD = 0.5, math.radians(15.0)  # sigmas with which a filter begins
 ROUGH_NS: Final = 5_000_000_000  # so often a lost robot looks for such a pose
+CONFIRMED_NS: Final = 10_000_000_000  # in which a robot that was carried away rejects nothing
 
 
 class SecondFilters:
@@ -55,6 +57,8 @@ class SecondFilters:
         self._bearing_variance = settings.sensor.bearing_sigma_rad**2
         self._names_of_landmarks, names = frozenset(field.landmarks), sorted(field.landmarks)
         self._has_other_landmarks = len(field.names) > 2
+        gives = [landmark.gives for landmark in field.landmarks.values()]
+        self._has_two_ranges = not self._has_other_landmarks and set(gives) == {"range"}
         self._left_out = [
             frozenset(names[i::FILTERS] if self._has_other_landmarks else ())
             for i in range(FILTERS)
@@ -139,7 +143,7 @@ class SecondFilters:
 
     def _correction(self, state: State, filters: Filters) -> Adaptation | None:
         """What these filters are sure of; None if it changes nothing."""
-        if not self._may_correct(state):
+        if not self._may_correct(state) or _is_jump_new(state, filters):
             return None
         present, are_doubtful = state.memory.calibration.adaptation, not self.scales.are_exact
         are_estimated = self.estimates_scales and are_doubtful
@@ -149,7 +153,9 @@ class SecondFilters:
     def _may_correct(self, state: State) -> bool:
         """Whether wrong settings may be corrected: a wrong distance between the only two landmarks
         of a map looks like wrong ranges, and where the robot once found that one is misplaced, that
-        is as likely."""
+        is as likely. Two ranges fit the mirror image of a way as well, with other errors."""
+        if self._has_two_ranges:
+            return False
         is_corrected = state.memory.calibration.adaptation.ranges != NO_RANGE_ERRORS
         return self._has_other_landmarks or is_corrected or not state.memory.recovery.misplaced
 
@@ -163,10 +169,9 @@ class SecondFilters:
         if not filters or any(f.rejected > MOST_REJECTED for f in filters):
             is_known &= estimate.heading_sigma_rad < MOST_BEGIN_RAD
             begin = estimate if is_known else self._rough_estimate(state)
-            if begin is None:
-                return ()
-            first = CalibrationFilter.at(now_ns, place, begin, gaps, self._first_sigmas)
-            return (first._replace(scales=memory.scales.factors),) * FILTERS
+            return () if begin is None else self._first(state, begin)
+        if _was_carried_away(state, filters):
+            return self._first(state, estimate)
         filters = tuple([f.for_scales(*memory.scales.factors) for f in filters])
         is_broken = gaps > filters[0].gaps or now_ns - filters[0].stamp_ns > LONGEST_NS
         is_broken |= odometry is not None and until_ns < now_ns
@@ -184,6 +189,14 @@ class SecondFilters:
             return tuple(after)
         of_blind = now_ns, place, estimate, gaps
         return tuple([f.with_pose(*of_blind) if f.is_blind else f for f in after])
+
+    def _first(self, state: State, begin: Estimate) -> Filters:
+        """Filters that know nothing yet but about where the robot is."""
+        now_ns, _, place, _, _, _, (recovery, _, memory, events) = state
+        gaps = events.get("odometry_gap", 0)
+        first = CalibrationFilter.at(now_ns, place, begin, gaps, self._first_sigmas)
+        jumped_ns = recovery.jump.stamp_ns if recovery.jump else -1
+        return (first._replace(scales=memory.scales.factors, jumped_ns=jumped_ns),) * FILTERS
 
     def _rough_estimate(self, state: State) -> Estimate | None:
         """Where a lost robot is if its ranges are hardly known; None if that determines no pose, or
@@ -223,6 +236,29 @@ def has_second_filters(common: CommonErrors | None) -> bool:
     """Whether a robot with these errors beside its pose has second filters: they know of no errors
     but a bias of bearings and those of ranges."""
     return common is None or common.is_of_bearings
+
+
+def _jump_since(state: State, filters: Filters) -> Jump | None:
+    """The jump of the robot to another place since these filters began: either it was carried away,
+    which they take for wrong settings, or its settings are wrong. None if it has not jumped."""
+    jump = state.memory.recovery.jump
+    return jump if jump is not None and jump.stamp_ns > filters[0].jumped_ns else None
+
+
+def _is_jump_new(state: State, filters: Filters) -> bool:
+    """Whether it is open yet if the robot was carried away: nothing is corrected so soon."""
+    jump = _jump_since(state, filters)
+    is_lost = bool(state.memory.recovery.lost)
+    return jump is not None and not is_lost and state.stamp_ns - jump.stamp_ns <= CONFIRMED_NS
+
+
+def _was_carried_away(state: State, filters: Filters) -> bool:
+    """Whether all that the robot measures since its jump confirms that it is there: then what the
+    filters found on the way is void."""
+    jump, recovery = _jump_since(state, filters), state.memory.recovery
+    if jump is None or recovery.lost or recovery.suspected_ns >= 0:
+        return False
+    return state.stamp_ns - jump.stamp_ns > CONFIRMED_NS
 
 
 def _at_pose(state: State, known: CalibrationFilter) -> State:

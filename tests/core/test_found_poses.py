@@ -174,12 +174,12 @@ def test_ranges_that_its_gates_accept_do_not_confirm_a_heading() -> None:
 
 
 @pytest.mark.parametrize(
-    ("count", "rejected", "is_lost"), [(1, 3, True), (1, 2, False), (2, 3, False)]
+    ("count", "rejected", "is_lost"), [(1, 3, True), (1, 2, False), (2, 8, False), (2, 9, True)]
 )
-def test_a_robot_that_measures_ranges_to_one_landmark_is_lost_as_soon_as_it_doubts_its_pose(
+def test_a_robot_that_measures_ranges_to_two_landmarks_at_most_is_lost_if_it_doubts_its_pose(
     count: int, rejected: int, is_lost: bool
 ) -> None:
-    """Nothing that it measures can dispel the doubt."""
+    """Nothing that it measures can dispel the doubt. With two, a wrong sigma is noticed first."""
     here, pieces = Pose2(2.0, 1.5, 0.0), []
     for i in range(1, 9):
         exact = piece(i * SPACING_NS, here, f"m{i % count}", *CORNERS[i % count])
