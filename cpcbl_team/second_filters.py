@@ -190,7 +190,7 @@ class SecondFilters:
         of_blind = now_ns, place, estimate, gaps
         return tuple([f.with_pose(*of_blind) if f.is_blind else f for f in after])
 
-    def _first(self, state: State, begin: Estimate) -> Filters:
+    def _first(self, state: State, begin: Estimate) -> tuple[CalibrationFilter, ...]:
         """Filters that know nothing yet but about where the robot is."""
         now_ns, _, place, _, _, _, (recovery, _, memory, events) = state
         gaps = events.get("odometry_gap", 0)

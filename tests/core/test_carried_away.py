@@ -40,7 +40,8 @@ def carried_away(seed: int, gives: Gives, names: str) -> tuple[State, list[float
 
     for i in range(250):
         if i == 50:
-            truth = Pose2(*rng.uniform(-1.5, 1.5, 2), rng.uniform(-3.1, 3.1))
+            x, y = rng.uniform(-1.5, 1.5, 2)
+            truth = Pose2(float(x), float(y), rng.uniform(-3.1, 3.1))
         turn = 0.04 + 0.1 * math.sin(i * 0.13)
         noise = 1.0 + 0.02 * rng.normal(), 1.0 + 0.05 * rng.normal()
         truth = step(truth, 0.08 * noise[0], turn * noise[1])
@@ -50,9 +51,9 @@ def carried_away(seed: int, gives: Gives, names: str) -> tuple[State, list[float
         seen = frame(truth, state.stamp_ns, robot.field)
         state = robot.cycle(state, Sightings(seen.stamp_ns, tuple(map(noisy, seen.sightings))))
         if i >= 200 and not state.lost:
-            (x, y, _), (xx, xy, yy, *_), _ = state.reported
-            place = Covariance2(xx, xy, yy)
-            late.append(place.mahalanobis_squared(truth.x - x, truth.y - y))
+            pose, (xx, xy, yy, *_), _ = state.reported
+            dx, dy = truth.x - pose.x, truth.y - pose.y
+            late.append(Covariance2(xx, xy, yy).mahalanobis_squared(dx, dy))
     return state, late
 
 
