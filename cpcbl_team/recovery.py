@@ -31,7 +31,7 @@ from cpcbl_team.miscalibration import (
     noise_with_factor,
 )
 from cpcbl_team.recovery_evidence import WINDOW_NS, latest
-from cpcbl_team.relocalization import are_apart, relocalize
+from cpcbl_team.relocalization import are_apart, readings_of, relocalize
 from cpcbl_team.sender_comparisons import SenderRecords, contest_m
 from cpcbl_team.sensor_mistakes import (
     MIRRORED,
@@ -140,14 +140,17 @@ class Recovery:
 
     def _unconfirmed(self, state: State, since_ns: int) -> str:
         """Why nothing that a suspicious robot measures can confirm its pose: it has only ranges to
-        one object, which agree with any pose at that distance, or to two, which agree with the
-        mirror image of its position and with any heading. Empty if something can."""
+        one object, which agree with any pose at that distance, or one reading of each of two, which
+        agree with other poses as well (with two ranges, with any heading). Empty if something
+        can."""
         rejected, _ = rejected_of(state.updates.innovations)
         if rejected < UNCONFIRMED:
             return ""
         evidence = self._evidence_since(state, since_ns)
-        is_determined = any(e.bearing_rad is not None or e.range_m is None for e in evidence)
+        has_ranges_only = all(e.bearing_rad is None for e in evidence)
         least = {1: UNCONFIRMED, 2: UNCONFIRMED_BY_TWO}.get(len({e.source for e in evidence}))
+        is_determined = any(readings_of(e) > 1 for e in evidence)
+        is_determined |= least == UNCONFIRMED and not has_ranges_only
         if is_determined or least is None or rejected < least:
             return ""
         return undetermined(evidence, state.updates.objects_ns, since_ns)
