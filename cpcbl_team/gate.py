@@ -4,7 +4,7 @@ from collections.abc import Iterable
 
 from cpcbl_team.config import LocalizationSettings
 from cpcbl_team.constraints import Constraint
-from cpcbl_team.estimate import Estimate, Scope
+from cpcbl_team.estimate import POSE, Estimate, Scope
 from cpcbl_team.measurements import (
     GatedObjects,
     Measurement,
@@ -38,8 +38,12 @@ class Gate:
     ) -> tuple[State, GatedObjects]:
         """The constraints of each object, accepted or rejected by the chi-square bound of their
         innovation, and the state at whose estimate they are linearized. If two poses agree with
-        what a robot with an uncertain heading measures, no object of the map is used."""
+        what a robot with an uncertain heading measures, no object of the map is used. Where no
+        Gaussian contains the pose, a mixture decides."""
         measured = sorted(measurements, key=lambda m: m.source)
+        state, accepted = self._relinearization.as_mixture(state, measured)
+        if accepted is not None:
+            return state, self._of_mixture(state, measured, accepted)
         found = self._relinearization.about_best_pose(state, measured)
         if found is None:
             of_teammates = [m for m in measured if m.sender]
@@ -49,6 +53,17 @@ class Gate:
         if about is None or gated.accepted:
             return after, gated
         return state, self._gated(state, measured, scope, None)
+
+    def _of_mixture(
+        self, state: State, measured: Iterable[Measurement], accepted: frozenset[str]
+    ) -> GatedObjects:
+        """The objects as they are about the estimate, and which of them the mixture accepts."""
+        objects = self._gated(state, measured, POSE, None)
+        gated = GatedObjects([], [])
+        for found in (*objects.accepted, *objects.rejected):
+            is_accepted = found.measurement.source in accepted
+            (gated.accepted if is_accepted else gated.rejected).append(found)
+        return gated
 
     def _gated(
         self,

@@ -92,7 +92,7 @@ class Localizer:
         self._timers = ObjectTimers(settings)
         self._variant = variant_of(settings, field)
         self._common = common_error_filter(settings, field, camera)
-        self._relinearization = Relinearization(settings, gates, self._common)
+        self._relinearization = Relinearization(settings, gates, self._common, field)
         self._gate = Gate(settings, gates, self._relinearization)
         self._landmarks = Landmarks(field, settings, gates, self._common is not None)
         self._calibration = OwnCalibration(settings, field, self._landmarks)

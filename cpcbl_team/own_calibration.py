@@ -163,7 +163,7 @@ class OwnCalibration:
         if not self._is_checked:
             return state
         now_ns, _, place, _, _, _, memory = state
-        _, _, calibration, _ = memory
+        calibration = memory.calibration
         _, _, _, check, present, _, _, common, *_ = calibration
         if not (has_second_filters(common) or is_precise(common)):
             return state

@@ -2,7 +2,7 @@
 
 from cpcbl_team.common_error_filter import CommonErrorFilter
 from cpcbl_team.config import LocalizationSettings
-from cpcbl_team.estimate import Estimate
+from cpcbl_team.estimate import ZERO3, Estimate
 from cpcbl_team.geometry import step
 from cpcbl_team.inputs import Odometry
 from cpcbl_team.motion import (
@@ -19,6 +19,7 @@ from cpcbl_team.sensors import time_at_min_speed_s
 from cpcbl_team.state import (
     State,
     with_calibration,
+    with_mixture,
     with_motion,
     with_odometry,
     with_recovery,
@@ -116,11 +117,14 @@ class Prediction:
         odometry have on it."""
         before, memory = state.estimate, state.memory.calibration
         estimate = self._variant.move(before, distance, turn, crawl_s, extra)
-        scales = memory.scales
-        if scales.are_exact or state.lost:
-            return state, estimate
-        scales, added = scales.after_motion(before, distance, turn)
-        covariance = estimate.covariance.plus(added)
-        estimate = self._variant.reduce(estimate._replace(covariance=covariance))
-        scales = scales._replace(estimate=estimate)
-        return with_calibration(state, memory._replace(scales=scales)), estimate
+        scales, added, mixture = memory.scales, ZERO3, state.memory.mixture
+        if not scales.are_exact and not state.lost:
+            scales, added = scales.after_motion(before, distance, turn)
+            covariance = estimate.covariance.plus(added)
+            estimate = self._variant.reduce(estimate._replace(covariance=covariance))
+            scales = scales._replace(estimate=estimate)
+            state = with_calibration(state, memory._replace(scales=scales))
+        if mixture is not None and mixture.is_of(before):
+            motion = self._variant.move(mixture.motion, distance, turn, crawl_s, extra)
+            state = with_mixture(state, mixture.after_motion(estimate, motion, added))
+        return state, estimate

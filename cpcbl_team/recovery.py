@@ -249,7 +249,7 @@ class Recovery:
     ) -> State:
         """The state of a robot that begins anew with an estimate that is independent of its former
         one."""
-        _, teammates, calibration, _ = memory = state.memory
+        _, teammates, calibration, _, _ = memory = state.memory
         common, filters = calibration.common, calibration.filters
         memory = memory._replace(
             recovery=recovery,

@@ -12,12 +12,13 @@ from typing import Final, NamedTuple
 from cpcbl_team.arc_fit import ArcFit, Measure, Scalar, best_fit, least_cost
 from cpcbl_team.arcs import Arc, about_own_pose, square_root
 from cpcbl_team.common_error_filter import CommonErrorFilter
-from cpcbl_team.config import LocalizationSettings, LocalizerSettings
+from cpcbl_team.config import Field, LocalizationSettings, LocalizerSettings
 from cpcbl_team.constraints import TELLS_NOTHING, Constraint, curved_variance
 from cpcbl_team.estimate import POSE, ZERO3, Estimate, Row, dot, row_sum
 from cpcbl_team.geometry import Pose2, wrap_angle
 from cpcbl_team.measurements import GatedObject, Measurement, constraints_of
-from cpcbl_team.state import State, with_common_errors
+from cpcbl_team.mixture_update import MixtureUpdate
+from cpcbl_team.state import State, with_common_errors, with_mixture
 
 BENT_VARIANCE: Final = math.radians(5.0) ** 2  # of the heading: above, tangents are no arcs
 NEARLY_KNOWN: Final = 0.2
@@ -28,6 +29,12 @@ NONLINEAR_SHARE: Final = 0.03
 """A reading is nonlinear if the square of what its linear form leaves out, within a sigma of the
 turn along the arc or of the offset, is more than this share of its variance. Range and bearing to
 the landmark that an arc is about are linear along it."""
+
+
+WIDE_VARIANCE: Final = 0.5**2
+"""m^2, of x and y together: above, readings may not be linear in a Gaussian. On a small field it is
+less:"""
+WIDE_SHARE: Final = 0.1**2  # of the square of half its diagonal
 
 
 class Linearization(NamedTuple):
@@ -103,18 +110,48 @@ class Relinearization:
         settings: LocalizationSettings,
         gates: tuple[float, float],
         common: CommonErrorFilter | None,
+        field: Field,
     ) -> None:
         """`gates`: chi-square bounds of one and of two constraints. `common`: the errors that
         depend on those of the pose."""
         self._rules, self._gates, self._common = settings.localizer, gates, common
+        self._mixtures = MixtureUpdate(settings.localizer, gates)
+        x0, y0, x1, y1 = field.bounds()
+        squared = 0.25 * ((x1 - x0) ** 2 + (y1 - y0) ** 2)
+        self._wide_variance = min(WIDE_VARIANCE, WIDE_SHARE * squared)
 
     def is_due(self, state: State) -> bool:
-        """Whether the estimate is a Gaussian along an arc only. (A robot that rejects what it
-        measures doubts its estimate, which is then no arc.)"""
-        memory = state.memory.recovery
-        is_doubt = memory.suspected_ns >= 0 or memory.kidnapped_ns >= 0
+        """Whether a Gaussian may not be what is known of the pose: it is one along an arc only, or
+        the position is so uncertain that readings may not be linear in it. (A robot that rejects
+        what it measures doubts its estimate.)"""
+        if not self._rules.estimates_whole_pose:
+            return False
+        xx, _, yy, _, _, hh = state.estimate.covariance
+        is_due = hh > BENT_VARIANCE or xx + yy > self._wide_variance
+        return (is_due or self._has_mixture(state)) and not _doubts(state)
+
+    def _has_mixture(self, state: State) -> bool:
+        """Whether the estimate is that of a mixture."""
+        mixture = state.memory.mixture
+        return mixture is not None and mixture.is_of(state.estimate)
+
+    def as_mixture(
+        self, state: State, measured: Sequence[Measurement]
+    ) -> tuple[State, frozenset[str] | None]:
+        """The state with its pose as a mixture that these objects have updated, and the sources
+        that it accepts. Without a mixture, and None, if readings are linear, or if places of
+        objects have errors that the estimate may contain already."""
+        is_due = self._common is None and self.is_due(state)
+        is_due = is_due and not any(m.is_dependent for m in measured)
+        if is_due and self._mixtures.is_nonlinear(state.estimate, measured):
+            mixture, accepted = self._mixtures.after_frame(state, measured)
+            return with_mixture(state, mixture), accepted
+        return (state if state.memory.mixture is None else with_mixture(state, None)), None
+
+    def _is_bent(self, state: State) -> bool:
+        """Whether the estimate is a Gaussian along an arc only."""
         is_bent = self._rules.estimates_whole_pose and state.estimate.covariance.hh > BENT_VARIANCE
-        return is_bent and not is_doubt
+        return is_bent and not _doubts(state)
 
     def about_best_pose(
         self, state: State, measurements: Iterable[Measurement]
@@ -124,7 +161,7 @@ class Relinearization:
         estimate is no arc, if these objects leave none, or if all of their readings are linear:
         each fit also follows the noise of its frame, so many fits would make certainty of a turn
         that nothing measures."""
-        if not self.is_due(state):
+        if not self._is_bent(state):
             return state, None
         arc, objects = Arc.of(state.estimate), [m for m in measurements if not m.sender]
         if not objects or not all(_leaves_arc(arc, m) for m in objects):
@@ -146,8 +183,11 @@ class Relinearization:
     ) -> Estimate:
         """The estimate after a frame whose objects were linearized at the pose of the state; where
         they may leave a turn about one of them undetermined, with a covariance about its own
-        pose."""
-        if not self.is_due(state) or not any(_leaves_a_turn(f.measurement) for f in accepted):
+        pose. After one that updated a mixture: its estimate."""
+        mixture = state.memory.mixture
+        if mixture is not None and mixture.updated_ns == state.stamp_ns:
+            return mixture.estimate
+        if not self._is_bent(state) or not any(_leaves_a_turn(f.measurement) for f in accepted):
             return estimate
         return about_own_pose(estimate, state.estimate.pose)
 
@@ -165,6 +205,12 @@ class Relinearization:
             ]
 
         return measure
+
+
+def _doubts(state: State) -> bool:
+    """Whether a robot doubts its estimate, because it rejects what it measures."""
+    memory = state.memory.recovery
+    return memory.suspected_ns >= 0 or memory.kidnapped_ns >= 0
 
 
 def _is_nonlinear(arc: Arc, measure: Measure) -> bool:

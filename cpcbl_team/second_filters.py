@@ -161,13 +161,16 @@ class SecondFilters:
 
     def _filters_after(self, state: State) -> tuple[CalibrationFilter, ...]:
         """The second filters after the landmarks that were seen since; empty before they begin."""
-        now_ns, estimate, place, odometry, until_ns, _, (recovery, _, memory, events) = state
+        now_ns, estimate, place, odometry, until_ns, _, (recovery, _, memory, events, mixture) = (
+            state
+        )
         filters, gaps = memory.filters, events.get("odometry_gap", 0)
         if not self._names_of_landmarks or not has_second_filters(memory.common):
             return filters
         is_known = not recovery.lost and estimate.position_sigma_m < MOST_BEGIN_M
         if not filters or any(f.rejected > MOST_REJECTED for f in filters):
             is_known &= estimate.heading_sigma_rad < MOST_BEGIN_RAD
+            is_known &= mixture is None or not mixture.is_of(estimate)
             begin = estimate if is_known else self._rough_estimate(state)
             return () if begin is None else self._first(state, begin)
         if _was_carried_away(state, filters):

@@ -21,6 +21,7 @@ from cpcbl_team.geometry import Pose2, new, wrap_angle
 from cpcbl_team.inputs import Belief, LandmarkBelief, Odometry, Sighting
 from cpcbl_team.miscalibration import with_doubts
 from cpcbl_team.own_pose import OwnPose
+from cpcbl_team.pose_mixtures import PoseMixture
 from cpcbl_team.scale_errors import with_scales_doubted
 from cpcbl_team.sender_records import SenderRecord
 
@@ -172,6 +173,7 @@ class Memory(NamedTuple):
     teammates: TeammateMemory = TeammateMemory()
     calibration: CalibrationMemory = CalibrationMemory()
     events: Mapping[str, int] = _NONE  # number of each thing but updates that is counted
+    mixture: PoseMixture | None = None  # the pose, where no Gaussian contains it
 
     def counted(self, *events: str) -> "Memory":
         """The memory in which each of these events has happened once more."""
@@ -194,7 +196,12 @@ class State(NamedTuple):
         """The estimate that others are told. Its covariance contains what may be wrong with the
         settings, too."""
         known = self.memory.calibration
-        estimate = with_doubts(with_arc_width(self.estimate), known.check)
+        estimate, mixture = self.estimate, self.memory.mixture
+        if mixture is not None and mixture.is_of(estimate):
+            estimate = mixture.whole()
+        else:
+            estimate = with_arc_width(estimate)
+        estimate = with_doubts(estimate, known.check)
         estimate = with_scales_doubted(estimate, known.scales)
         return with_doubt(estimate, self.odometry_from_robot, known.filters, known.adaptation)
 
@@ -314,8 +321,8 @@ def with_landmark(state: State, belief: LandmarkBelief) -> State:
 
 def with_teammates(state: State, teammates: TeammateMemory) -> State:
     """The state with this memory of teammates."""
-    recovery, _, calibration, events = state.memory
-    return with_memory(state, new(Memory, (recovery, teammates, calibration, events)))
+    recovery, _, calibration, events, mixture = state.memory
+    return with_memory(state, new(Memory, (recovery, teammates, calibration, events, mixture)))
 
 
 def with_senders(teammates: TeammateMemory, senders: Mapping[str, SenderRecord]) -> TeammateMemory:
@@ -326,14 +333,14 @@ def with_senders(teammates: TeammateMemory, senders: Mapping[str, SenderRecord])
 
 def with_recovery(state: State, recovery: RecoveryMemory) -> State:
     """The state with this memory of the recovery."""
-    _, teammates, calibration, events = state.memory
-    return with_memory(state, new(Memory, (recovery, teammates, calibration, events)))
+    _, teammates, calibration, events, mixture = state.memory
+    return with_memory(state, new(Memory, (recovery, teammates, calibration, events, mixture)))
 
 
 def with_calibration(state: State, calibration: CalibrationMemory) -> State:
     """The state with this memory of the calibration."""
-    recovery, teammates, _, events = state.memory
-    return with_memory(state, new(Memory, (recovery, teammates, calibration, events)))
+    recovery, teammates, _, events, mixture = state.memory
+    return with_memory(state, new(Memory, (recovery, teammates, calibration, events, mixture)))
 
 
 def at_new_pose(state: State, estimate: Estimate) -> State:
@@ -342,6 +349,11 @@ def at_new_pose(state: State, estimate: Estimate) -> State:
     state = with_calibration(state, memory._replace(scales=memory.scales.at_new_pose()))
     state = with_teammates(state, state.memory.teammates._replace(own=None))
     return state._replace(estimate=estimate)
+
+
+def with_mixture(state: State, mixture: PoseMixture | None) -> State:
+    """The state whose pose is this mixture (None: it is a Gaussian)."""
+    return with_memory(state, state.memory._replace(mixture=mixture))
 
 
 def with_common_errors(state: State, common: CommonErrors) -> State:

@@ -66,7 +66,7 @@ class StationaryCheck:
 
     def _waiting(self, state: State, prior: Estimate) -> State | None:
         """The state where evidence tells nothing yet; None where it does."""
-        stamp_ns, _, place, _, _, _, (recovery, _, calibration, _) = state
+        stamp_ns, _, place, _, _, _, (recovery, _, calibration, _, _) = state
         record = calibration.stationary
         if record is None:
             return state if recovery.lost else self._with_new_record(state, prior)

@@ -309,7 +309,8 @@ def test_a_range_repeated_beside_its_landmark_makes_no_certainty(
     variant: Variant, general: bool
 ) -> None:
     """The robot stands 1.5 m from a post, 1 m off across the line of sight: the circle bends by
-    0.3 m, which no repetition averages away."""
+    0.3 m, which no repetition averages away. (The exact posterior has 0.95 as yy. The components
+    of a mixture come within a tenth of that.)"""
     field = Field(landmarks={"post": Landmark(x_m=1.5, y_m=0.0, gives="range")})
     robot = localizer(variant, field, odometry=OdometrySettings(moves=False))
     state = state_at(Pose2(0.0, 0.0, 0.0), diagonal(1.0, 0.1))
@@ -318,5 +319,5 @@ def test_a_range_repeated_beside_its_landmark_makes_no_certainty(
         state = robot.cycle(state, Sightings((i + 1) * SECOND // 10, (reading,)))
     xx, xy, yy, *_ = state.estimate.covariance
     off = np.array([state.estimate.pose.x, state.estimate.pose.y - 1.0])
-    assert yy > 0.9  # one range says nothing along its circle
+    assert yy > (0.86 if state.memory.mixture else 0.9)  # one range says nothing along its circle
     assert off @ np.linalg.solve([[xx, xy], [xy, yy]], off) < 9.0

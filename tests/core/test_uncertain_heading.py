@@ -183,17 +183,42 @@ def about_post(estimate: Estimate) -> float:
     return dot(turn, covariance.inverse().times(turn))
 
 
-def test_a_mirror_image_is_not_taken() -> None:
-    """A range to a post straight ahead agrees with two poses, so nothing of it is used."""
+def test_both_mirror_images_are_kept() -> None:
+    """A range to a post straight ahead agrees with two poses: the estimate contains both."""
     field = Field(landmarks={"post": Landmark(x_m=16.0, y_m=0.0, gives="range")})
     robot = localizer(field=field)
     begin = state_at(Pose2(0.0, 0.0, 0.0), diagonal(0.05, math.radians(30.0)))
     blind = robot.predict(robot.add_odometry(begin, Odometry(0, SECOND, 10.0, 0.0)), SECOND)
     truth = Pose2(10.0 * math.cos(0.5), 10.0 * math.sin(0.5), 0.5)
     seen = robot.cycle(blind, frame(truth, SECOND, field))
+    assert seen.counts["accepted"] == 1
+    mixture = seen.memory.mixture
+    assert mixture is not None
+    for side in (1.0, -1.0):
+        near = [
+            c
+            for c in mixture.components
+            if math.hypot(c.pose.x - truth.x, c.pose.y - side * truth.y) < 0.6
+        ]
+        assert sum(c.weight for c in near) == pytest.approx(0.5, abs=0.1)
+    (x, y, _), (_, _, yy, *_), _ = seen.estimate
+    assert (x, y) == pytest.approx((truth.x, 0.0), abs=0.1)
+    assert math.sqrt(yy) == pytest.approx(truth.y, rel=0.1)
+
+
+def test_two_poses_that_agree_with_uncertain_places_are_not_taken() -> None:
+    """The same where the place of the post is uncertain: then nothing of it is used."""
+    post = Landmark(x_m=16.0, y_m=0.0, gives="range", sigma_m=0.05)
+    field = Field(landmarks={"post": post})
+    start = Start(x_m=0.0, y_m=0.0, sigma_m=0.05, heading_sigma_deg=30.0)
+    robot = localizer(field=field, start=start)
+    ahead = Odometry(0, SECOND, 10.0, 0.0)
+    blind = robot.predict(robot.add_odometry(robot.start(0), ahead), SECOND)
+    truth = Pose2(10.0 * math.cos(0.5), 10.0 * math.sin(0.5), 0.5)
+    seen = robot.cycle(blind, frame(truth, SECOND, field))
     assert seen.counts[AMBIGUOUS] == 1
     assert "accepted" not in seen.counts
-    assert seen.estimate == blind.estimate
+    assert seen.estimate.pose == blind.estimate.pose
 
 
 def test_a_driver_that_is_wrong_is_rejected_and_moves_nothing() -> None:

@@ -1,0 +1,175 @@
+"""A pose that no Gaussian contains, as a mixture of Gaussians.
+
+A robot that hardly knows its pose is somewhere along curves, or at one of several places, after it
+sees objects that give one reading each. A weighted sum of Gaussians can follow such a distribution
+if each of them is so narrow that readings are linear in it (Alspach & Sorenson, Nonlinear Bayesian
+estimation using Gaussian sum approximations, IEEE Transactions on Automatic Control 17, 1972). The
+robot's estimate has the mean and the covariance of the whole sum.
+"""
+
+import math
+from collections.abc import Iterable, Sequence
+from typing import Final, NamedTuple
+
+from cpcbl_team.arcs import Arc, lever_change
+from cpcbl_team.estimate import (
+    ZERO3,
+    Covariance3,
+    Estimate,
+    Matrix3,
+    Row,
+    dot,
+    outer,
+    pose_difference,
+)
+from cpcbl_team.geometry import Pose2, wrap_angle
+
+AT_REST: Final = Estimate(Pose2(0.0, 0.0, 0.0), ZERO3)
+NARROWER: Final = 0.5  # the variance of each component of a normal distribution that is split
+BESIDE: Final = math.sqrt(3.0 * (1.0 - NARROWER))  # where the outer ones are, in sigmas
+OUTER_WEIGHT: Final = 1.0 / 6.0
+"""With these weights the sum has the moments of the normal distribution up to the fifth: the nodes
+are those of the Gauss-Hermite quadrature."""
+PARTS: Final = (
+    (OUTER_WEIGHT, -BESIDE),
+    (1.0 - 2.0 * OUTER_WEIGHT, 0.0),
+    (OUTER_WEIGHT, BESIDE),
+)
+SAME: Final = 1.0  # the squared Mahalanobis distance below which two components become one
+LEAST_WEIGHT: Final = 1e-5  # of a component, as a share of the sum
+
+
+class Component(NamedTuple):
+    """One Gaussian of a mixture."""
+
+    weight: float
+    pose: Pose2
+    covariance: Covariance3
+
+    def split(self, x: float, y: float) -> "list[Component]":
+        """Three components that are narrower along a direction of the field (a unit vector)."""
+        column = self.covariance.times((x, y, 0.0))
+        sigma = math.sqrt(x * column[0] + y * column[1])
+        step = column[0] / sigma, column[1] / sigma, column[2] / sigma
+        narrow = self.covariance.plus(outer(step), NARROWER - 1.0)
+        return [
+            Component(w * self.weight, _with_step(self.pose, step, k), narrow) for w, k in PARTS
+        ]
+
+    def split_along_arc(self) -> "list[Component]":
+        """Three components with narrower headings, along the arc on which an uncertain heading
+        puts the position."""
+        arc = Arc.of(Estimate(self.pose, self.covariance))
+        turn_variance = arc.covariance.hh
+        narrow, turn = (
+            arc.covariance._replace(hh=NARROWER * turn_variance),
+            math.sqrt(turn_variance),
+        )
+        offsets = [(weight, (0.0, 0.0, k * turn)) for weight, k in PARTS]
+        return [
+            Component(weight * self.weight, arc.at(at), narrow.transformed(arc.jacobian(at)))
+            for weight, at in offsets
+        ]
+
+    def after_motion(self, motion: Estimate) -> "Component":
+        """After a motion, which is with its covariance in the frame of the robot before it."""
+        pose, (x, y, turn) = self.pose, motion.pose
+        c, s = math.cos(pose.heading), math.sin(pose.heading)
+        dx, dy = c * x - s * y, s * x + c * y
+        led = self.covariance.transformed(lever_change(dx, dy))
+        added = motion.covariance.transformed(rotation(c, s))
+        there = Pose2(pose.x + dx, pose.y + dy, wrap_angle(pose.heading + turn))
+        return Component(self.weight, there, led.plus(added))
+
+
+def rotation(c: float, s: float) -> Matrix3:
+    """The matrix that turns an error (x, y, heading) into a frame turned by an angle with this
+    cosine and sine."""
+    return c, -s, 0.0, s, c, 0.0, 0.0, 0.0, 1.0
+
+
+def _with_step(pose: Pose2, step: Row, k: float) -> Pose2:
+    """The pose k steps away."""
+    x, y, turn = step
+    return Pose2(pose.x + k * x, pose.y + k * y, wrap_angle(pose.heading + k * turn))
+
+
+class PoseMixture(NamedTuple):
+    """A mixture at the last frame that updated it (`updated_ns`), and the motion since then, in the
+    frame of the robot at that time.
+
+    `estimate`: the one of the state that belongs to it now. If the state has another one, something
+    else has corrected that since, and the mixture is no longer true.
+    """
+
+    components: tuple[Component, ...]
+    estimate: Estimate
+    updated_ns: int
+    motion: Estimate = AT_REST
+
+    def is_of(self, estimate: Estimate) -> bool:
+        """Whether it belongs to an estimate."""
+        return self.estimate[:2] == estimate[:2]
+
+    def components_now(self) -> list[Component]:
+        """The components after the motion."""
+        return [c.after_motion(self.motion) for c in self.components]
+
+    def whole(self) -> Estimate:
+        """The mean and the covariance of the mixture after the motion."""
+        return estimate_of(self.components_now(), self.estimate)
+
+    def after_motion(
+        self, estimate: Estimate, motion: Estimate, added: Covariance3
+    ) -> "PoseMixture":
+        """After another piece of the motion, which has led the state to this estimate. `motion`:
+        with this piece. `added`: what errors of the odometry's scales have added to the covariance
+        in the field's frame."""
+        if added is not ZERO3:
+            turned = motion.pose.heading - estimate.pose.heading
+            added = added.transformed(rotation(math.cos(turned), math.sin(turned)))
+            motion = motion._replace(covariance=motion.covariance.plus(added))
+        return self._replace(estimate=estimate, motion=motion)
+
+
+def estimate_of(components: Sequence[Component], like: Estimate) -> Estimate:
+    """The mean and the covariance of a mixture. All of it is shared with teammates if some of the
+    estimate before it (`like`) was."""
+    pose, covariance = moments(components)
+    return Estimate(pose, covariance, ZERO3 if like.shared is ZERO3 else covariance)
+
+
+def moments(components: Sequence[Component]) -> tuple[Pose2, Covariance3]:
+    """The mean and the covariance of a mixture, whose headings are averaged as offsets from that of
+    its heaviest component."""
+    heaviest = max(components, key=lambda c: c.weight).pose
+    total = sum(c.weight for c in components)
+    offsets = [(c, pose_difference(heaviest, c.pose)) for c in components]
+    x, y, turn = (sum(c.weight * off[i] for c, off in offsets) / total for i in range(3))
+    covariance = ZERO3
+    for c, (ox, oy, oh) in offsets:
+        spread = outer((ox - x, oy - y, oh - turn))
+        covariance = covariance.plus(c.covariance.plus(spread), c.weight / total)
+    return _with_step(heaviest, (x, y, turn), 1.0), covariance
+
+
+def merged(components: Iterable[Component]) -> tuple[Component, ...]:
+    """The mixture with weights of the sum 1, without components that hardly count, and with those
+    as one that are nearly the same, as both of them see it."""
+    heaviest_first = sorted(components, key=lambda c: -c.weight)
+    least = LEAST_WEIGHT * sum(c.weight for c in heaviest_first)
+    left = [(c, c.covariance.inverse()) for c in heaviest_first if c.weight > least]
+    total, found = sum(c.weight for c, _ in left), []
+    while left:
+        (first, inverse), *_ = left
+        same: list[tuple[Component, Covariance3]] = []
+        others: list[tuple[Component, Covariance3]] = []
+        for pair in left:
+            off = pose_difference(first.pose, pair[0].pose)
+            is_same = dot(off, inverse.times(off)) < SAME and dot(off, pair[1].times(off)) < SAME
+            (same if is_same else others).append(pair)
+        alike = [c for c, _ in same]
+        weight = sum(c.weight for c in alike)
+        found.append(Component(weight / total, *moments(alike)))
+        left = others
+    return tuple(found)

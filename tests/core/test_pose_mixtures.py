@@ -1,0 +1,183 @@
+"""Robots that hardly know their pose and see objects that give one reading each."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from support.core import (
+    SECOND,
+    covariance3,
+    diagonal,
+    displaced,
+    localizer,
+    matrix3,
+    point_sighting,
+    random_matrix,
+    sensor_noise,
+    state_at,
+)
+from support.sweeps import over_seeds
+
+from cpcbl_launch.reporting.metrics import Samples, Score, score
+from cpcbl_team.config import Field, Gives, Landmark, OdometrySettings, SensorSettings, Start
+from cpcbl_team.estimate import Estimate
+from cpcbl_team.geometry import Pose2, step
+from cpcbl_team.inputs import Odometry, Sighting, Sightings
+from cpcbl_team.localizer import Localizer
+from cpcbl_team.motion import motion_noise, move
+from cpcbl_team.pose_mixtures import Component, PoseMixture, merged, moments
+from cpcbl_team.state import State
+
+ODOMETRY, SENSOR = OdometrySettings(), SensorSettings()
+PIECE_NS = SECOND // 10
+seeds_of_priors = st.integers(0, 10_000)
+angles = st.floats(-math.pi, math.pi)
+
+
+def landmarks_giving(first: Gives, second: Gives) -> dict[str, Landmark]:
+    return {
+        "a": Landmark(x_m=1.0, y_m=1.0, gives=first),
+        "b": Landmark(x_m=7.0, y_m=5.0, gives=second),
+    }
+
+
+def run(
+    landmarks: dict[str, Landmark], sigma_m: float, sigma_deg: float, blind_m: float, seed: int
+) -> list[tuple[State, Pose2]]:
+    """States with true poses: after so far ahead that nothing is seen in, 20 s on a circle of 2 m
+    about (4, 3), from a start with these sigmas."""
+    rng, now = np.random.default_rng(seed), 0
+    start = Start(
+        x_m=6.0,
+        y_m=3.0 - blind_m,
+        heading_deg=90.0,
+        sigma_m=sigma_m,
+        heading_sigma_deg=sigma_deg,
+    )
+    robot = localizer(field=Field(landmarks=landmarks), start=start, odometry=ODOMETRY)
+    noise, state = sensor_noise(rng, SENSOR), robot.start(0)
+    truth = displaced(state.estimate.pose, state.estimate.covariance, rng)
+    found = []
+    pieces = [(0.1, 0.0)] * round(blind_m / 0.1) + [(0.04, 0.02)] * 200
+    for k, (distance, turn) in enumerate(pieces):
+        drift = motion_noise(truth.heading, distance, turn, ODOMETRY)
+        truth = displaced(step(truth, distance, turn), drift, rng)
+        state = robot.add_odometry(state, Odometry(now, now + PIECE_NS, distance, turn))
+        now += PIECE_NS
+        if turn and k % 2:
+            seen = [noise(point_sighting(truth, n, p.x_m, p.y_m)) for n, p in landmarks.items()]
+            state = robot.cycle(state, Sightings(now, tuple(seen)))
+            found.append((state, truth))
+    return found
+
+
+def scored(rows: list[tuple[State, Pose2]]) -> Score:
+    estimates = np.array([state.reported.pose for state, _ in rows])
+    covariances = np.array([state.reported.covariance for state, _ in rows])
+    return score(Samples(estimates, np.array([truth for _, truth in rows]), covariances))
+
+
+@over_seeds(8, 60)
+@pytest.mark.parametrize(
+    ("landmarks", "sigma_m", "sigma_deg", "blind_m"),
+    [
+        (landmarks_giving("range", "bearing"), 1.0, 45.0, 0.0),
+        (landmarks_giving("range", "range"), 1.0, 45.0, 0.0),
+        (landmarks_giving("range", "range"), 1.5, 3.0, 0.0),
+        ({"a": Landmark(x_m=1.0, y_m=1.0, gives="bearing")}, 0.05, 15.0, 10.0),
+    ],
+    ids=["a range and a bearing", "two ranges", "a wide position", "a bearing, after 10 m"],
+)
+def test_a_robot_that_hardly_knows_its_pose_is_as_certain_as_it_may_be(
+    landmarks: dict[str, Landmark], sigma_m: float, sigma_deg: float, blind_m: float, seeds: range
+) -> None:
+    """As one Gaussian it had a NEES of 31, 33, 3 and 55, and was inside 3 sigma for 92, 95, 97 and
+    86 % of the time."""
+    rows = [row for s in seeds for row in run(landmarks, sigma_m, sigma_deg, blind_m, s)]
+    found = scored(rows)
+    assert found.nees is not None
+    assert found.inside_3_sigma is not None
+    assert found.nees < 3.5
+    assert found.inside_3_sigma > 0.9
+    assert np.mean([bool(state.lost) for state, _ in rows]) < 0.15
+
+
+@given(seeds_of_priors, angles, angles)
+def test_parts_of_a_component_have_its_moments(seed: int, heading: float, across: float) -> None:
+    covariance = covariance3(random_matrix(np.random.default_rng(seed), 3))
+    whole = Component(0.3, Pose2(1.0, -2.0, heading), covariance)
+    parts = whole.split(math.cos(across), math.sin(across))
+    pose, after = moments(parts)
+    assert sum(c.weight for c in parts) == pytest.approx(0.3)
+    assert (pose.x, pose.y) == pytest.approx((1.0, -2.0))
+    assert matrix3(after) == pytest.approx(matrix3(covariance), abs=1e-9)
+    row = math.cos(across), math.sin(across), 0.0
+    narrower = np.array(row) @ matrix3(parts[0].covariance) @ np.array(row)
+    assert narrower == pytest.approx(0.5 * np.array(row) @ matrix3(covariance) @ np.array(row))
+
+
+@given(seeds_of_priors)
+def test_what_is_nearly_the_same_becomes_one_with_the_same_moments(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    poses = [Pose2(*rng.uniform(-0.5, 0.5, size=3).tolist()) for _ in range(12)]
+    before = [
+        Component(float(rng.uniform(0.1, 1.0)), pose, covariance3(random_matrix(rng, 3)))
+        for pose in poses
+    ]
+    after = merged(before)
+    assert sum(c.weight for c in after) == pytest.approx(1.0)
+    (pose, covariance), (was, covariance_was) = moments(after), moments(before)
+    assert pose == pytest.approx(was, abs=1e-9)
+    assert matrix3(covariance) == pytest.approx(matrix3(covariance_was), abs=1e-9)
+
+
+@given(angles, st.floats(-1.0, 1.0), st.floats(-1.0, 1.0))
+def test_a_motion_is_that_of_the_odometry(heading: float, first: float, second: float) -> None:
+    """Of a single component; it is compounded from the pieces that came since the last frame."""
+    begin = Estimate(Pose2(1.0, 2.0, heading), diagonal(0.1, 0.2))
+    alone = Component(1.0, *begin[:2])
+    mixture, now = PoseMixture((alone,), begin, 0), begin
+    for turn in (first, second):
+        now = move(now, 0.5, turn, ODOMETRY)
+        motion = move(mixture.motion, 0.5, turn, ODOMETRY)
+        mixture = mixture._replace(estimate=now, motion=motion)
+    whole = mixture.whole()
+    assert (whole.pose.x, whole.pose.y) == pytest.approx((now.pose.x, now.pose.y))
+    assert matrix3(whole.covariance) == pytest.approx(matrix3(now.covariance), abs=1e-9)
+
+
+@pytest.fixture
+def robot() -> Localizer:
+    """It may see the range to one post."""
+    return localizer(field=Field(landmarks={"post": Landmark(x_m=3.0, y_m=0.0, gives="range")}))
+
+
+def beside_post(robot: Localizer) -> State:
+    """After the first range, of which no Gaussian contains the circle."""
+    before = state_at(Pose2(0.0, 0.0, 0.0), diagonal(1.0, math.radians(20.0)))
+    return robot.cycle(before, Sightings(0, (Sighting("post", 2.5, 0.0),)))
+
+
+def test_what_no_component_accepts_changes_nothing(robot: Localizer) -> None:
+    seen = beside_post(robot)
+    assert seen.memory.mixture is not None
+    after = robot.cycle(seen, Sightings(0, (Sighting("post", 40.0, 0.0),)))
+    assert after.counts == {"accepted": 1, "gated": 1}
+    assert after.estimate == seen.estimate
+    assert after.memory.mixture == seen.memory.mixture
+
+
+def test_a_mixture_ends_where_something_else_corrects_the_estimate(robot: Localizer) -> None:
+    seen = beside_post(robot)
+    mixture = seen.memory.mixture
+    assert mixture is not None
+    assert mixture.is_of(seen.estimate)
+    known = Estimate(Pose2(1.0, 0.0, 0.0), diagonal(0.05, 0.1))
+    moved_on = robot.predict(
+        robot.add_odometry(seen._replace(estimate=known), Odometry(0, SECOND, 1.0, 0.0)), SECOND
+    )
+    left = moved_on.memory.mixture
+    assert left is None or not left.is_of(moved_on.estimate)
+    assert moved_on.reported.pose.x == pytest.approx(2.0)
