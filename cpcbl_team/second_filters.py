@@ -195,7 +195,7 @@ class SecondFilters:
 
     def _first(self, state: State, begin: Estimate) -> tuple[CalibrationFilter, ...]:
         """Filters that know nothing yet but about where the robot is."""
-        now_ns, _, place, _, _, _, (recovery, _, memory, events) = state
+        now_ns, _, place, _, _, _, (recovery, _, memory, events, _) = state
         gaps = events.get("odometry_gap", 0)
         first = CalibrationFilter.at(now_ns, place, begin, gaps, self._first_sigmas)
         jumped_ns = recovery.jump.stamp_ns if recovery.jump else -1
