@@ -3,8 +3,7 @@
 import pytest
 
 from cpcbl_team.gaussian import Covariance2
-from cpcbl_team.mean_comparisons import compared_with_own_sensors
-from cpcbl_team.mean_offsets import MeanOffset
+from cpcbl_team.mean_offsets import MeanOffset, compared_with_own_sensors
 
 
 def at(x: float, y: float = 0.0, sigma: float = 0.01) -> MeanOffset:
