@@ -93,7 +93,7 @@ def is_explained_by(
 ) -> bool:
     """Whether a pose that was found leaves nothing of the robot's own evidence out."""
     own = [e for e in evidence if not e.from_teammate]
-    return all(_chi_square(found, e, odometry_from_robot) < OUTLIER for e in own)
+    return not _outliers(found, own, odometry_from_robot)
 
 
 def explains_as_well(
@@ -112,8 +112,14 @@ def explains_as_well(
 def contradicts(known: Estimate, evidence: Sequence[Evidence], odometry_from_robot: Pose2) -> bool:
     """Whether so many pieces of evidence contradict a pose that they are no outliers (names that
     were misread, reflections)."""
-    far = [e for e in evidence if _chi_square(known, e, odometry_from_robot) >= OUTLIER]
-    return len(far) >= LEAST_CONTRADICTIONS
+    return len(_outliers(known, evidence, odometry_from_robot)) >= LEAST_CONTRADICTIONS
+
+
+def _outliers(
+    known: Estimate, evidence: Sequence[Evidence], odometry_from_robot: Pose2
+) -> list[Evidence]:
+    """The pieces of evidence that contradict a pose."""
+    return [e for e in evidence if _chi_square(known, e, odometry_from_robot) >= OUTLIER]
 
 
 def _chi_square(known: Estimate, e: Evidence, odometry_from_robot: Pose2) -> float:
@@ -148,17 +154,15 @@ def kept_at_trusted_pose(
         return None
     if misplaced and not exchanged and explaining_mistake(state, memory, evidence, None):
         return None  # nothing can be said of objects before the driver is mended
-    is_elsewhere = found is not None and not agrees(known, found)
-    if misplaced and not exchanged and found is not None and is_elsewhere:
+    elsewhere = None if found is None or agrees(known, found) else found
+    if misplaced and not exchanged and elsewhere is not None:
         # Readings that determine no pose agree with others as well, and the map fits at one of them
         is_determined = sum(map(readings_of, comparison.agreeing)) >= UNKNOWNS
-        if not is_determined and is_explained_by(found, evidence, place):
+        if not is_determined and is_explained_by(elsewhere, evidence, place):
             return None
     if not misplaced:
         latest = [e for e in evidence if e.stamp_ns >= state.stamp_ns - LATEST_NS]
-        if found is None or not is_elsewhere:
-            return None
-        if not explains_as_well(known, found, latest, place):
+        if elsewhere is None or not explains_as_well(known, elsewhere, latest, place):
             return None
     until_ns = state.stamp_ns + UNUSED_NS
     named = {**memory.misplaced, **dict.fromkeys(sorted(misplaced), until_ns)}

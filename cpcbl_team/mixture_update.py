@@ -78,8 +78,8 @@ class MixtureUpdate:
     ) -> tuple[PoseMixture, frozenset[str]]:
         """The mixture after a frame, and the sources that it accepts. What no component accepts
         changes nothing."""
-        mixture, estimate = state.memory.mixture, state.estimate
-        if mixture is None or not mixture.is_of(estimate):
+        mixture, estimate = state.mixture, state.estimate
+        if mixture is None:
             alone = Component(1.0, *estimate[:2])
             mixture = PoseMixture((alone,), estimate, state.stamp_ns)
         components, used = mixture.components_now(), list(measured)

@@ -117,14 +117,14 @@ class Prediction:
         odometry have on it."""
         before, memory = state.estimate, state.memory.calibration
         estimate = self._variant.move(before, distance, turn, crawl_s, extra)
-        scales, added, mixture = memory.scales, ZERO3, state.memory.mixture
+        scales, added, mixture = memory.scales, ZERO3, state.mixture
         if not scales.are_exact and not state.lost:
             scales, added = scales.after_motion(before, distance, turn)
             covariance = estimate.covariance.plus(added)
             estimate = self._variant.reduce(estimate._replace(covariance=covariance))
             scales = scales._replace(estimate=estimate)
             state = with_calibration(state, memory._replace(scales=scales))
-        if mixture is not None and mixture.is_of(before):
+        if mixture is not None:
             motion = self._variant.move(mixture.motion, distance, turn, crawl_s, extra)
             state = with_mixture(state, mixture.after_motion(estimate, motion, added))
         return state, estimate

@@ -147,11 +147,14 @@ class Recovery:
         if rejected < UNCONFIRMED:
             return ""
         evidence = self._evidence_since(state, since_ns)
-        has_ranges_only = all(e.bearing_rad is None for e in evidence)
-        least = {1: UNCONFIRMED, 2: UNCONFIRMED_BY_TWO}.get(len({e.source for e in evidence}))
-        is_determined = any(readings_of(e) > 1 for e in evidence)
-        is_determined |= least == UNCONFIRMED and not has_ranges_only
-        if is_determined or least is None or rejected < least:
+        objects = len({e.source for e in evidence})
+        if objects == 1 and all(e.bearing_rad is None for e in evidence):
+            least = UNCONFIRMED
+        elif objects == 2:
+            least = UNCONFIRMED_BY_TWO
+        else:
+            return ""
+        if rejected < least or any(readings_of(e) > 1 for e in evidence):
             return ""
         return undetermined(evidence, state.updates.objects_ns, since_ns)
 

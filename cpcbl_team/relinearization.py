@@ -30,11 +30,10 @@ NONLINEAR_SHARE: Final = 0.03
 turn along the arc or of the offset, is more than this share of its variance. Range and bearing to
 the landmark that an arc is about are linear along it."""
 
-
-WIDE_VARIANCE: Final = 0.5**2
-"""m^2, of x and y together: above, readings may not be linear in a Gaussian. On a small field it is
-less:"""
-WIDE_SHARE: Final = 0.1**2  # of the square of half its diagonal
+# Above the smaller of both, of x and y together, readings may not be linear in a Gaussian. (On a
+# map of a single landmark the smaller one is 0: all frames are examined.)
+WIDE_VARIANCE: Final = 0.5**2  # m^2
+WIDE_SHARE: Final = 0.1**2  # of the square of half the field's diagonal
 
 
 class Linearization(NamedTuple):
@@ -128,12 +127,7 @@ class Relinearization:
             return False
         xx, _, yy, _, _, hh = state.estimate.covariance
         is_due = hh > BENT_VARIANCE or xx + yy > self._wide_variance
-        return (is_due or self._has_mixture(state)) and not _doubts(state)
-
-    def _has_mixture(self, state: State) -> bool:
-        """Whether the estimate is that of a mixture."""
-        mixture = state.memory.mixture
-        return mixture is not None and mixture.is_of(state.estimate)
+        return (is_due or state.mixture is not None) and not _doubts(state)
 
     def as_mixture(
         self, state: State, measured: Sequence[Measurement]
@@ -150,8 +144,7 @@ class Relinearization:
 
     def _is_bent(self, state: State) -> bool:
         """Whether the estimate is a Gaussian along an arc only."""
-        is_bent = self._rules.estimates_whole_pose and state.estimate.covariance.hh > BENT_VARIANCE
-        return is_bent and not _doubts(state)
+        return state.estimate.covariance.hh > BENT_VARIANCE and self.is_due(state)
 
     def about_best_pose(
         self, state: State, measurements: Iterable[Measurement]
@@ -185,7 +178,7 @@ class Relinearization:
         they may leave a turn about one of them undetermined, with a covariance about its own
         pose. After one that updated a mixture: its estimate."""
         mixture = state.memory.mixture
-        if mixture is not None and mixture.updated_ns == state.stamp_ns:
+        if accepted and mixture is not None and mixture.updated_ns == state.stamp_ns:
             return mixture.estimate
         if not self._is_bent(state) or not any(_leaves_a_turn(f.measurement) for f in accepted):
             return estimate

@@ -57,8 +57,7 @@ class SecondFilters:
         self._bearing_variance = settings.sensor.bearing_sigma_rad**2
         self._names_of_landmarks, names = frozenset(field.landmarks), sorted(field.landmarks)
         self._has_other_landmarks = len(field.names) > 2
-        gives = [landmark.gives for landmark in field.landmarks.values()]
-        self._has_two_ranges = not self._has_other_landmarks and set(gives) == {"range"}
+        self._has_two_ranges = not self._has_other_landmarks and field.gives_only_ranges
         self._left_out = [
             frozenset(names[i::FILTERS] if self._has_other_landmarks else ())
             for i in range(FILTERS)
@@ -161,20 +160,18 @@ class SecondFilters:
 
     def _filters_after(self, state: State) -> tuple[CalibrationFilter, ...]:
         """The second filters after the landmarks that were seen since; empty before they begin."""
-        now_ns, estimate, place, odometry, until_ns, _, (recovery, _, memory, events, mixture) = (
-            state
-        )
+        now_ns, estimate, place, odometry, until_ns, _, (recovery, _, memory, events, _) = state
         filters, gaps = memory.filters, events.get("odometry_gap", 0)
         if not self._names_of_landmarks or not has_second_filters(memory.common):
             return filters
         is_known = not recovery.lost and estimate.position_sigma_m < MOST_BEGIN_M
         if not filters or any(f.rejected > MOST_REJECTED for f in filters):
             is_known &= estimate.heading_sigma_rad < MOST_BEGIN_RAD
-            is_known &= mixture is None or not mixture.is_of(estimate)
+            is_known &= state.mixture is None
             begin = estimate if is_known else self._rough_estimate(state)
-            return () if begin is None else self._first(state, begin)
+            return () if begin is None else self._begun_at(state, begin)
         if _was_carried_away(state, filters):
-            return self._first(state, estimate)
+            return self._begun_at(state, estimate)
         filters = tuple([f.for_scales(*memory.scales.factors) for f in filters])
         is_broken = gaps > filters[0].gaps or now_ns - filters[0].stamp_ns > LONGEST_NS
         is_broken |= odometry is not None and until_ns < now_ns
@@ -193,7 +190,7 @@ class SecondFilters:
         of_blind = now_ns, place, estimate, gaps
         return tuple([f.with_pose(*of_blind) if f.is_blind else f for f in after])
 
-    def _first(self, state: State, begin: Estimate) -> tuple[CalibrationFilter, ...]:
+    def _begun_at(self, state: State, begin: Estimate) -> tuple[CalibrationFilter, ...]:
         """Filters that know nothing yet but about where the robot is."""
         now_ns, _, place, _, _, _, (recovery, _, memory, events, _) = state
         gaps = events.get("odometry_gap", 0)
@@ -251,8 +248,9 @@ def _jump_since(state: State, filters: Filters) -> Jump | None:
 def _is_jump_new(state: State, filters: Filters) -> bool:
     """Whether it is open yet if the robot was carried away: nothing is corrected so soon."""
     jump = _jump_since(state, filters)
-    is_lost = bool(state.memory.recovery.lost)
-    return jump is not None and not is_lost and state.stamp_ns - jump.stamp_ns <= CONFIRMED_NS
+    if jump is None or state.lost:
+        return False
+    return state.stamp_ns - jump.stamp_ns <= CONFIRMED_NS
 
 
 def _was_carried_away(state: State, filters: Filters) -> bool:

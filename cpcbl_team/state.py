@@ -192,15 +192,18 @@ class State(NamedTuple):
     memory: Memory = Memory()
 
     @property
+    def mixture(self) -> PoseMixture | None:
+        """The mixture that the pose is; None where it is a Gaussian."""
+        kept = self.memory.mixture
+        return kept if kept is not None and kept.is_of(self.estimate) else None
+
+    @property
     def reported(self) -> Estimate:
         """The estimate that others are told. Its covariance contains what may be wrong with the
         settings, too."""
         known = self.memory.calibration
-        estimate, mixture = self.estimate, self.memory.mixture
-        if mixture is not None and mixture.is_of(estimate):
-            estimate = mixture.whole()
-        else:
-            estimate = with_arc_width(estimate)
+        mixture = self.mixture
+        estimate = with_arc_width(self.estimate) if mixture is None else mixture.whole()
         estimate = with_doubts(estimate, known.check)
         estimate = with_scales_doubted(estimate, known.scales)
         return with_doubt(estimate, self.odometry_from_robot, known.filters, known.adaptation)

@@ -6,12 +6,11 @@ import math
 import numpy as np
 import pytest
 from msgspec.structs import replace
-from support.core import CORNERS, SECOND, diagonal, frame, localizer, state_at
+from support.core import CORNERS, SECOND, diagonal, frame, localizer, sensor_noise, state_at
 
 from cpcbl_team.config import Field, Gives, SensorSettings
-from cpcbl_team.gaussian import Covariance2
-from cpcbl_team.geometry import Pose2, step, wrap_angle
-from cpcbl_team.inputs import Odometry, Sighting, Sightings
+from cpcbl_team.geometry import Pose2, step
+from cpcbl_team.inputs import Odometry
 from cpcbl_team.miscalibration import AS_CONFIGURED
 from cpcbl_team.state import State
 
@@ -28,32 +27,23 @@ def carried_away(seed: int, gives: Gives, names: str) -> tuple[State, list[float
     marks = {n: replace(CORNERS.landmarks[n], gives=gives) for n in names.split()}
     robot = localizer("joint", sensor=SENSOR, field=Field(landmarks=marks))
     rng, truth = np.random.default_rng(seed), Pose2(0.5, -0.3, 0.4)
-    state, late = state_at(truth, diagonal(0.05, 0.05)), list[float]()
-
-    def noisy(s: Sighting) -> Sighting:
-        range_m, bearing_rad = s.range_m, s.bearing_rad
-        if range_m is not None:
-            range_m *= 1.0 + SENSOR.range_share * rng.normal()
-        if bearing_rad is not None:
-            bearing_rad = wrap_angle(bearing_rad + SENSOR.bearing_sigma_rad * rng.normal())
-        return replace(s, range_m=range_m, bearing_rad=bearing_rad)
-
+    noise, late = sensor_noise(rng, SENSOR), list[float]()
+    state = state_at(truth, diagonal(0.05, 0.05))
     for i in range(250):
         if i == 50:
             x, y = rng.uniform(-1.5, 1.5, 2)
             truth = Pose2(float(x), float(y), rng.uniform(-3.1, 3.1))
         turn = 0.04 + 0.1 * math.sin(i * 0.13)
-        noise = 1.0 + 0.02 * rng.normal(), 1.0 + 0.05 * rng.normal()
-        truth = step(truth, 0.08 * noise[0], turn * noise[1])
+        slip, twist = 1.0 + 0.02 * rng.normal(), 1.0 + 0.05 * rng.normal()
+        truth = step(truth, 0.08 * slip, turn * twist)
         begin_ns = state.odometry_until_ns
         piece = Odometry(begin_ns, begin_ns + PERIOD, 0.08, turn)
         state = robot.predict(robot.add_odometry(state, piece), piece.stamp_ns)
-        seen = frame(truth, state.stamp_ns, robot.field)
-        state = robot.cycle(state, Sightings(seen.stamp_ns, tuple(map(noisy, seen.sightings))))
+        state = robot.cycle(state, frame(truth, piece.stamp_ns, robot.field, noise=noise))
         if i >= 200 and not state.lost:
-            pose, (xx, xy, yy, *_), _ = state.reported
-            dx, dy = truth.x - pose.x, truth.y - pose.y
-            late.append(Covariance2(xx, xy, yy).mahalanobis_squared(dx, dy))
+            pose, covariance, _ = state.reported
+            off = truth.x - pose.x, truth.y - pose.y
+            late.append(covariance.position().mahalanobis_squared(*off))
     return state, late
 
 

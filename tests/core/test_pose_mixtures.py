@@ -183,3 +183,20 @@ def test_a_mixture_ends_where_something_else_corrects_the_estimate(robot: Locali
     left = moved_on.memory.mixture
     assert left is None or not left.is_of(moved_on.estimate)
     assert moved_on.reported.pose.x == pytest.approx(2.0)
+
+
+def test_a_frame_at_the_time_of_a_mixture_that_has_ended_updates_the_estimate() -> None:
+    """The first estimate was corrected by something else at that time; the map is so large that the
+    second frame is not examined."""
+    posts = {
+        "post": Landmark(x_m=3.0, y_m=0.0, gives="range"),
+        "far": Landmark(x_m=-30.0, y_m=20.0, gives="range"),
+    }
+    robot = localizer(field=Field(landmarks=posts))
+    seen = beside_post(robot)
+    assert seen.memory.mixture is not None
+    known = Estimate(Pose2(1.0, 0.0, 0.0), diagonal(0.05, 0.02))
+    after = robot.cycle(seen._replace(estimate=known), Sightings(0, (Sighting("post", 2.0, 0.0),)))
+    assert after.counts["accepted"] == 2
+    assert after.estimate.pose.x == pytest.approx(1.0)
+    assert after.estimate.covariance.xx < known.covariance.xx
