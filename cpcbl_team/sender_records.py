@@ -10,7 +10,9 @@ What follows from them, and from the mean of the reports (`mean_offsets.py`), is
 """
 
 import math
+from collections.abc import Mapping
 from enum import StrEnum
+from types import MappingProxyType
 from typing import Final, NamedTuple
 
 import msgspec
@@ -46,6 +48,7 @@ CLEAR_CONFLICTS = 0.5  # so many conflicts speak against a sender if one was jus
 REPEATED_CONFLICTS = 1.5  # and so many at any time: an old one alone may be chance
 JUST_BEFORE_NS: Final = 2_000_000_000
 NEVER_NS: Final = -(2**62)
+NO_EVIDENCE: Final[Mapping[str, float]] = MappingProxyType({})
 
 
 class QuarantineReason(StrEnum):
@@ -148,6 +151,9 @@ class SenderRecord(msgspec.Struct, frozen=True, gc=False):
     """With whom it is in a contest, until that is decided: also while either is silent."""
     wrong_ns: int = NEVER_NS  # since when others say without interruption that its mean is wrong
     own_nis: float = 0.0  # of its last report, against the pose by own sensors
+    behind: Mapping[str, float] = NO_EVIDENCE
+    """How much more likely other senders make the robot's own readings than this one does, where
+    they contradict it (`hypotheses.py`): differences of chi-squares, by name."""
     confirmed: int = 0  # reports beside which another source agreed with it
     is_guest: bool = False
     headings: FadingTurns = NO_TURNS  # that it reported
@@ -183,6 +189,7 @@ def without_comparisons(record: SenderRecord) -> SenderRecord:
         position=new.position,
         offsets=new.offsets,
         means=new.means,
+        behind=new.behind,
         headings=new.headings,
         courses=new.courses,
     )

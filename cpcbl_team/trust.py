@@ -21,8 +21,10 @@ from typing import Final, NamedTuple
 
 from msgspec.structs import replace
 
+from cpcbl_team.compromises import compromise
 from cpcbl_team.config import TrustSettings
-from cpcbl_team.mean_offsets import FAST, Comparison, disagreement
+from cpcbl_team.mean_comparisons import Comparison
+from cpcbl_team.mean_offsets import FAST, disagreement
 from cpcbl_team.sender_comparisons import (
     OWN_SENSORS,
     RECENT_NS,
@@ -125,8 +127,10 @@ def assess(
     out = _outvoted_majority(decision, report.stamp_ns) if decision.quarantined else None
     if out:
         decision = _without_decision(decision, out, report.stamp_ns)
-    least_m = max(decision.least_sigma_m, contest_m(decision.senders, name))
-    is_used = decision.trusted and not is_left_out_guest(decision.senders, name, report.stamp_ns)
+    senders, between = decision.senders, compromise(decision.senders, name)
+    least_m = 0.0 if between else max(decision.least_sigma_m, contest_m(senders, name))
+    is_used = decision.trusted and not (between and between.is_outweighed)
+    is_used = is_used and not is_left_out_guest(senders, name, report.stamp_ns)
     return decision._replace(trusted=is_used, least_sigma_m=least_m)
 
 
@@ -195,8 +199,9 @@ def _decide_dispute(
     supporters = supporters_of_estimate(recent, dissenters, claims, began_ns)
     if not supporters:
         return TrustDecision(senders, True)
-    if any(r.name in supporters for n in dissenters for r in open_rivals(senders, n)):
-        return TrustDecision(senders, True)
+    rivals = {r.name for n in dissenters for r in open_rivals(senders, n)}
+    if not rivals.isdisjoint(supporters) or any(senders[n].behind for n in dissenters):
+        return TrustDecision(senders, True)  # they are compared by other tests
     is_only_of_team = not members(recent, supporters) and len(members(recent, dissenters)) == 1
     if is_only_of_team and OWN_SENSORS not in dissenters | supporters:
         return _without_decision(TrustDecision(senders, True), dissenters, now_ns)
@@ -236,9 +241,6 @@ def _is_odometry_wrong(senders: SenderRecords, name: str, rules: TrustSettings) 
         r.odometry_conflicts >= 1.0 or (other == OWN_SENSORS and r.score > 0.5 * rules.limit)
         for other, r in recent_senders(senders, senders[name].last_report_ns, name)
     )
-
-
-# Quarantine ---------------------------------------------------------------------------------------
 
 
 def _quarantine(senders: SenderRecords, name: str, now_ns: int, used_ns: int) -> TrustDecision:

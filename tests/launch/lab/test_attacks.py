@@ -156,6 +156,15 @@ def test_two_liars_are_no_majority_while_a_correct_observer_does_not_see_the_nav
 
 
 @pytest.mark.thorough
+def test_two_liars_of_four_mislead_no_robot_with_eyes_for_long() -> None:
+    """Own readings decide between two sides that the estimate follows both."""
+    _, row = rows_of([EVERY["overclaimed", "navigator"]], [1])
+    assert row.held  # 1.57 before
+    assert row.least_inside_3_sigma > 0.97
+    assert row.false_quarantines == 0
+
+
+@pytest.mark.thorough
 def test_no_correct_observer_is_quarantined_for_what_own_eyes_see_along_another_axis() -> None:
     """In this seed the landmarks were off by two sigmas in y, where the liars say nothing."""
     run = run_attack(EVERY["one axis", "navigator"], 2)
