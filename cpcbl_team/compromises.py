@@ -40,8 +40,9 @@ class Compromise(NamedTuple):
 
 def compromise(senders: SenderRecords, name: str) -> Compromise | None:
     """That between a sender and those that say something else; None while own readings tell
-    nothing, and without such senders."""
-    behind = senders[name].behind if name in senders else NO_EVIDENCE
+    nothing, without such senders, and for a sender in quarantine, which is tested by itself."""
+    is_used = name in senders and senders[name].reason is None
+    behind = senders[name].behind if is_used else NO_EVIDENCE
     opponents = _opponents(senders, name) if behind else []
     if not opponents:
         return None

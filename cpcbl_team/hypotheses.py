@@ -26,7 +26,8 @@ from cpcbl_team.trust import BY_COMPARISON
 
 FADING_NS: Final = 20_000_000_000  # time constant with which evidence fades
 HELD_NS: Final = 10_000_000_000  # hypotheses are kept for so long after the last contradiction
-MOST_GAIN: Final = 6.0  # one frame counts for no more than this difference of chi-squares
+MOST_GAIN: Final = 6.0  # one frame counts for no more than this difference of chi-squares,
+MOST_EVIDENCE: Final = 30.0  # and all together for no more, so that a change is noticed soon
 SUSPICIOUS_M: Final = 0.05  # a possible bias of this size is looked into
 MOST_HYPOTHESES: Final = 12
 
@@ -94,7 +95,8 @@ def with_gains(
                 if other != name:
                     ahead = 2.0 * (gain - fresh[name])
                     ahead = min(max(ahead, -MOST_GAIN), MOST_GAIN)
-                    behind[other] = behind.get(other, 0.0) + ahead
+                    total = behind.get(other, 0.0) + ahead
+                    behind[other] = min(max(total, -MOST_EVIDENCE), MOST_EVIDENCE)
         found[name] = replace(senders[name], behind=behind)
     for name, record in senders.items():
         if record.behind and name not in gains:

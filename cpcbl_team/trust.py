@@ -23,7 +23,7 @@ from msgspec.structs import replace
 
 from cpcbl_team.compromises import compromise
 from cpcbl_team.config import TrustSettings
-from cpcbl_team.mean_comparisons import Comparison
+from cpcbl_team.mean_comparisons import EVIDENCE_ON_MOST, Comparison
 from cpcbl_team.mean_offsets import FAST, disagreement
 from cpcbl_team.sender_comparisons import (
     OWN_SENSORS,
@@ -200,7 +200,7 @@ def _decide_dispute(
     if not supporters:
         return TrustDecision(senders, True)
     rivals = {r.name for n in dissenters for r in open_rivals(senders, n)}
-    if not rivals.isdisjoint(supporters) or any(senders[n].behind for n in dissenters):
+    if not rivals.isdisjoint(supporters) or any(_is_open(senders[n]) for n in dissenters):
         return TrustDecision(senders, True)  # they are compared by other tests
     is_only_of_team = not members(recent, supporters) and len(members(recent, dissenters)) == 1
     if is_only_of_team and OWN_SENSORS not in dissenters | supporters:
@@ -233,6 +233,12 @@ def _is_estimate_right(
     if for_it != against:
         return for_it > against
     return True if now_ns - began_ns >= TIE_NS else None
+
+
+def _is_open(record: SenderRecord) -> bool:
+    """Whether own readings are compared with what this sender reports, and do not speak clearly
+    against it."""
+    return bool(record.behind) and max(record.behind.values()) <= EVIDENCE_ON_MOST
 
 
 def _is_odometry_wrong(senders: SenderRecords, name: str, rules: TrustSettings) -> bool:
