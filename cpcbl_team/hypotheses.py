@@ -20,9 +20,8 @@ from cpcbl_team.fixes import PoseObservation
 from cpcbl_team.fusion import mark_shared
 from cpcbl_team.own_pose import NO_HYPOTHESES, OwnPose
 from cpcbl_team.sender_comparisons import OWN_SENSORS, RECENT_NS, SenderRecords
-from cpcbl_team.sender_records import NEVER_NS, NO_EVIDENCE, SenderRecord
+from cpcbl_team.sender_records import BY_COMPARISON, NEVER_NS, NO_EVIDENCE, SenderRecord
 from cpcbl_team.state import State
-from cpcbl_team.trust import BY_COMPARISON
 
 FADING_NS: Final = 20_000_000_000  # time constant with which evidence fades
 HELD_NS: Final = 10_000_000_000  # hypotheses are kept for so long after the last contradiction

@@ -29,6 +29,7 @@ from cpcbl_team.parameters import Sensitivity, sensitivity_dot
 from cpcbl_team.recovery_evidence import without_senders
 from cpcbl_team.sender_comparisons import OWN_SENSORS, RECENT_NS, SenderRecords
 from cpcbl_team.sender_records import (
+    BY_COMPARISON,
     CONTRADICTING_NIS,
     SILENCE_NS,
     QuarantineReason,
@@ -42,7 +43,7 @@ from cpcbl_team.state import (
     with_memory,
     with_teammates,
 )
-from cpcbl_team.trust import BY_COMPARISON, reset_scores
+from cpcbl_team.trust import reset_scores
 
 GUESSED_NS: Final = 100_000_000  # odometry that is missing for longer does not only come late
 

@@ -62,6 +62,14 @@ class QuarantineReason(StrEnum):
     HEADING = "heading"
 
 
+# The reasons that rest on what other senders reported
+BY_COMPARISON: Final = (
+    QuarantineReason.BIASED,
+    QuarantineReason.OVERCONFIDENT,
+    QuarantineReason.OUTVOTED,
+)
+
+
 class ReportedPosition(NamedTuple):
     """Where a sender reported this robot, in the field's frame, and its odometry at that time."""
 

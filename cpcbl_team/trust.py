@@ -25,6 +25,7 @@ from cpcbl_team.compromises import compromise
 from cpcbl_team.config import TrustSettings
 from cpcbl_team.mean_comparisons import EVIDENCE_ON_MOST, Comparison
 from cpcbl_team.mean_offsets import FAST, disagreement
+from cpcbl_team.overturned_quarantines import outvoted_majority, witnesses_of_contest
 from cpcbl_team.sender_comparisons import (
     OWN_SENSORS,
     RECENT_NS,
@@ -44,6 +45,7 @@ from cpcbl_team.sender_comparisons import (
     wrong_turn,
 )
 from cpcbl_team.sender_records import (
+    BY_COMPARISON,
     CONTRADICTING_NIS,
     JUMP_SIGMAS,
     MOST_NIS,
@@ -69,12 +71,7 @@ MOST_CONFLICTS = 2.5  # with more a sender is quarantined: at the third within a
 LEAST_AGREEMENTS = 10  # reports that must agree with the estimate before a sender is readmitted,
 LEAST_CONFIRMATIONS = 2  # or distances that must agree with odometry
 PERSISTENCE_NS: Final = 500_000_000  # a mean that is wrong for so long is no chance
-ALIKE_M: Final = 0.05  # two senders whose offsets differ by no more, or by half of them, agree
 LEAST_UNITED: Final = 2  # teammates that agree with each other against the estimate
-MAJORITY_NS: Final = 20_000_000_000  # most senders are not found wrong within so short a time
-
-# The reasons that rest on what other senders reported
-BY_COMPARISON = QuarantineReason.BIASED, QuarantineReason.OVERCONFIDENT, QuarantineReason.OUTVOTED
 
 
 class TrustDecision(NamedTuple):
@@ -124,9 +121,14 @@ def assess(
     """The records after a report of the sender `name`, and whether the report may be used.
     `used_ns`: when a report of this sender was last used."""
     decision = _decide(senders, name, report, used_ns, rules)
-    out = _outvoted_majority(decision, report.stamp_ns) if decision.quarantined else None
+    now_ns, found = report.stamp_ns, decision.quarantined
+    out = outvoted_majority(decision.senders, found, now_ns) if found else None
     if out:
-        decision = _without_decision(decision, out, report.stamp_ns)
+        decision = _without_decision(decision, out, now_ns)
+    witnesses = witnesses_of_contest(decision.senders, name, now_ns)
+    if witnesses:
+        heard = {n: released(decision.senders[n], now_ns) for n in witnesses}
+        decision = decision._replace(senders={**decision.senders, **heard}, event="readmitted")
     senders, between = decision.senders, compromise(decision.senders, name)
     least_m = 0.0 if between else max(decision.least_sigma_m, contest_m(senders, name))
     is_used = decision.trusted and not (between and between.is_outweighed)
@@ -272,24 +274,6 @@ def _quarantine_supporters(
     changed = {n: quarantined(senders[n], QuarantineReason.OUTVOTED, now_ns) for n in names}
     changed = {**senders, **changed, **{n: replace(senders[n], score=0.0) for n in dissenters}}
     return TrustDecision(changed, name not in names, "outvoted", names, max(errors_m))
-
-
-def _outvoted_majority(decision: TrustDecision, now_ns: int) -> frozenset[str]:
-    """The senders that were quarantined lately, and that agree with those that are now, if they are
-    half or more of three or more senders while the robot's own sensors say nothing; else none."""
-    recent = {n: r for n, r in decision.senders.items() if now_ns - r.last_report_ns <= RECENT_NS}
-    if OWN_SENSORS in recent or votes(recent, recent, recent) < 3:
-        return frozenset()
-    new = [recent[n].mean_offset for n in decision.quarantined if n in recent]
-    out = frozenset(
-        n
-        for n, r in recent.items()
-        if r.reason in BY_COMPARISON
-        and now_ns - r.since_ns <= MAJORITY_NS
-        and all(math.dist(r.mean_offset, o) <= ALIKE_M + 0.5 * math.hypot(*o) for o in new)
-    )
-    is_half = 2 * votes(recent, out, recent) >= votes(recent, recent, recent)
-    return out if is_half else frozenset()
 
 
 def _without_decision(decision: TrustDecision, side: Collection[str], now_ns: int) -> TrustDecision:
