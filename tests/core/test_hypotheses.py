@@ -16,6 +16,7 @@ from support.core import (
     loop,
     placed_at,
 )
+from support.trust import RULES
 
 from cpcbl_team.augmented_update import AugmentedUpdate, Reading, ScoredUpdate
 from cpcbl_team.camera_errors import NO_ERRORS
@@ -35,6 +36,7 @@ from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.geometry import Pose2
 from cpcbl_team.hypotheses import (
     HELD_NS,
+    MOST_EVIDENCE,
     MOST_GAIN,
     MOST_HYPOTHESES,
     SUSPICIOUS_M,
@@ -43,13 +45,14 @@ from cpcbl_team.hypotheses import (
     with_hypotheses,
 )
 from cpcbl_team.localizer import Localizer
-from cpcbl_team.mean_comparisons import EVIDENCE, compared_with_own_sensors
+from cpcbl_team.mean_comparisons import EVIDENCE, EVIDENCE_ON_MOST, compared_with_own_sensors
 from cpcbl_team.mean_offsets import MeanOffset
 from cpcbl_team.miscalibration import AS_CONFIGURED
 from cpcbl_team.own_pose import OwnPose
 from cpcbl_team.sender_comparisons import OWN_SENSORS
-from cpcbl_team.sender_records import QuarantineReason, Rival, SenderRecord
+from cpcbl_team.sender_records import QuarantineReason, Rival, SenderRecord, TeammateReport
 from cpcbl_team.state import State
+from cpcbl_team.trust import assess
 
 NOW_NS = 100 * SECOND
 PLACE = Pose2(1.0, 2.0, 0.3)
@@ -159,6 +162,9 @@ def test_evidence_is_the_sum_of_differences_while_both_report() -> None:
     assert 1.9 < twice["a"].behind["b"] < 2.0  # the first one has faded a little
     outlier = with_gains(senders, {**gains, "a": -50.0}, NOW_NS - SECOND // 10, NOW_NS)
     assert outlier["a"].behind["b"] == MOST_GAIN
+    for _ in range(20):  # the evidence of a long time does not outweigh that of the present
+        outlier = with_gains(outlier, {**gains, "a": -50.0}, NOW_NS, NOW_NS)
+    assert (outlier["a"].behind["b"], outlier["b"].behind["a"]) == (MOST_EVIDENCE, -MOST_EVIDENCE)
     assert with_gains(found, {}, NOW_NS, NOW_NS)["a"].behind == {}
 
 
@@ -192,6 +198,37 @@ def opposed(behind: float, **change: object) -> dict[str, SenderRecord]:
         for x, name, b in ((0.2, "b", behind), (0.0, "a", -behind))
     )
     return {"a": one, "b": replace(other, **change)}
+
+
+@pytest.mark.parametrize(
+    ("behind", "is_found"),
+    [(0.0, False), (EVIDENCE_ON_MOST, False), (EVIDENCE_ON_MOST + 1.0, True)],
+)
+def test_a_dispute_is_decided_where_own_readings_speak_clearly_against_the_sender(
+    behind: float, is_found: bool
+) -> None:
+    """One that is suddenly far off has no new mean: each report is an outlier, by test 1."""
+    limit, since_ns = RULES.limit, NOW_NS - SECOND
+    liar = SenderRecord(
+        NOW_NS, score=2.0 * limit, dispute_since_ns=since_ns, behind={"honest": behind}
+    )
+    senders = {"liar": liar, "honest": says(0.0), OWN_SENSORS: says(0.0)}
+    senders = {n: r if r is liar else agreeing(r) for n, r in senders.items()}
+    report = TeammateReport(NOW_NS, 50.0, (0.7, 0.0))
+    decision = assess(senders, "liar", report, since_ns, RULES)
+    assert decision.quarantined == ({"liar"} if is_found else set())
+
+
+def agreeing(record: SenderRecord) -> SenderRecord:
+    return replace(record, last_agreement_ns=NOW_NS)
+
+
+def test_one_in_quarantine_is_tested_by_what_it_reports() -> None:
+    """At the compromise with its opponents one that is correct again would look wrong."""
+    senders = opposed(2.0)
+    assert compromise(senders, "a") is not None
+    senders["a"] = replace(senders["a"], reason=QuarantineReason.BIASED)
+    assert compromise(senders, "a") is None
 
 
 @pytest.mark.parametrize(("behind", "share"), [(0.0, 0.5), (2.0, 0.731), (-2.0, 0.269)])
