@@ -24,13 +24,10 @@ from cpcbl_team.mean_headings import NO_TURNS, FadingTurns, MeanTurn, contradict
 from cpcbl_team.mean_offsets import (
     ALTERNATING_NS,
     FAST,
-    NOTHING,
     SLOW,
-    USUAL,
     MeanOffset,
     contradicts,
     disagreement,
-    lead,
 )
 from cpcbl_team.sender_records import NEVER_NS, SILENCE_NS, Rival, SenderRecord
 
@@ -54,34 +51,6 @@ def senders_with_a_say(senders: SenderRecords, name: str, now_ns: int) -> Sender
     """The recent senders that count in a dispute about a report of `name`."""
     silenced = {*doubted_guests(senders, now_ns)} - {name}
     return {n: r for n, r in recent_senders(senders, now_ns) if n not in silenced}
-
-
-def supporters_of_estimate(
-    recent: SenderRecords,
-    dissenters: Collection[str],
-    claims: Collection[tuple[float, float]],
-    began_ns: int,
-) -> set[str]:
-    """The sources that agreed with the estimate since a dispute began, and do not agree as well
-    with the `claims` of the senders that contradict it (offsets from the estimate, m)."""
-    return {
-        name
-        for name, r in recent.items()
-        if name not in dissenters
-        and r.last_agreement_ns > max(began_ns, r.dispute_since_ns)
-        and _denies(r, claims)
-    }
-
-
-def _denies(record: SenderRecord, claims: Collection[tuple[float, float]]) -> bool:
-    """Whether the mean of a source is nearer to the estimate than to these offsets from it, by more
-    than usual noise. A source that is too vague to tell agrees with both sides of a dispute. (A
-    source without a mean is believed by its single reports.)"""
-    mean = record.means[FAST]
-    if mean is None:
-        return True
-    estimate = MeanOffset(0.0, 0.0, NOTHING, stamp_ns=mean.stamp_ns)
-    return all(lead(estimate, estimate._replace(x=x, y=y), mean) > USUAL for x, y in claims)
 
 
 def members(senders: SenderRecords, names: Collection[str]) -> list[str]:

@@ -128,6 +128,16 @@ class Rival(NamedTuple):
     y: float
 
 
+class Denial(NamedTuple):
+    """What a source says of a sender that contradicts the estimate, since a dispute with it began:
+    how much farther its reports are from there than from the estimate (a sum of differences of
+    chi-squares)."""
+
+    of: str
+    since_ns: int
+    chi_square: float
+
+
 class SenderRecord(msgspec.Struct, frozen=True, gc=False):
     """What the robot remembers of one sender."""
 
@@ -157,6 +167,7 @@ class SenderRecord(msgspec.Struct, frozen=True, gc=False):
     """m^2: of the error that its reports may have in common, by what others say."""
     rivals: tuple[Rival, ...] = ()
     """With whom it is in a contest, until that is decided: also while either is silent."""
+    denial: Denial | None = None  # of the sender that contradicts the estimate most
     wrong_ns: int = NEVER_NS  # since when others say without interruption that its mean is wrong
     own_nis: float = 0.0  # of its last report, against the pose by own sensors
     behind: Mapping[str, float] = NO_EVIDENCE
@@ -198,6 +209,7 @@ def without_comparisons(record: SenderRecord) -> SenderRecord:
         offsets=new.offsets,
         means=new.means,
         behind=new.behind,
+        denial=new.denial,
         headings=new.headings,
         courses=new.courses,
     )

@@ -23,6 +23,7 @@ from msgspec.structs import replace
 
 from cpcbl_team.compromises import compromise
 from cpcbl_team.config import TrustSettings
+from cpcbl_team.disputes import supporters_of_estimate, with_denial
 from cpcbl_team.mean_comparisons import EVIDENCE_ON_MOST, Comparison
 from cpcbl_team.mean_offsets import FAST, disagreement
 from cpcbl_team.overturned_quarantines import outvoted_majority, witnesses_of_contest
@@ -38,7 +39,6 @@ from cpcbl_team.sender_comparisons import (
     recent_senders,
     rival_of,
     senders_with_a_say,
-    supporters_of_estimate,
     votes,
     voting_means,
     with_comparison,
@@ -143,6 +143,8 @@ def _decide(
     now = report.stamp_ns
     record = with_report(senders.get(name, SenderRecord()), report, rules.limit)
     senders = {**senders, name: record}
+    record = with_denial(senders, name, report.evidence, now)
+    senders = {**senders, name: record}
     comparison = compare(senders, name, now)
     if comparison is not None:
         record = with_comparison(senders, name, comparison, now)
@@ -197,8 +199,7 @@ def _decide_dispute(
         return TrustDecision(senders, True)
     began_ns = min(disputes_ns)
     dissenters = {n for n, r in recent.items() if r.score > 0.5 * rules.limit}
-    claims = [r.mean_offset for r in recent.values() if r.score > rules.limit]
-    supporters = supporters_of_estimate(recent, dissenters, claims, began_ns)
+    supporters = supporters_of_estimate(recent, dissenters, rules.limit, began_ns)
     if not supporters:
         return TrustDecision(senders, True)
     rivals = {r.name for n in dissenters for r in open_rivals(senders, n)}
