@@ -131,6 +131,25 @@ class AugmentedUpdate:
         return self.covariance.transformed(lever_change(dx, dy)), parameters
 
 
+class ScoredUpdate(AugmentedUpdate):
+    """An update that sums up how likely its readings are."""
+
+    log_likelihood = 0.0
+    """Without the part that is the same for all poses: -1/2 (innovation^2 / variance +
+    log(variance))."""
+
+    def add(self, reading: Reading) -> None:
+        """One more reading."""
+        h, c, residual, variance = reading
+        (ax, ay, ah), of_reading = self._inflated.times(h, c)
+        px, py, ph = self.covariance.times(h)
+        of_pose = dot(h, (px + ax, py + ay, ph + ah))
+        total = of_pose + sensitivity_dot(c, of_reading) + sharpest(variance)
+        innovation = residual - dot(h, self._offset) - sensitivity_dot(c, self._changes)
+        self.log_likelihood -= 0.5 * (innovation * innovation / total + math.log(total))
+        super().add(reading)
+
+
 def estimated_of(common: CommonErrors, with_camera: bool) -> tuple[bool, ...]:
     """Which of the common errors are estimated: the places of objects, perhaps the camera's."""
     return (with_camera,) * CAMERA + (True,) * (len(common.values) - CAMERA)

@@ -272,9 +272,11 @@ class CommonErrorFilter:
 
     def own_pose_for(self, own: OwnPose, state: State) -> OwnPose | None:
         """The pose by own sensors with the same objects as the state, in the same order: what is
-        known of those that the robot has seen since is what the map says. None if the places that
-        the robot has found are others now."""
+        known of those seen since is what the map says. None if places that it found are others."""
         ours, common = own.common, common_errors_of(state)
+        if own.by_sender:
+            poses = {n: self.own_pose_for(pose, state) for n, pose in own.by_sender.items()}
+            own = own._replace(by_sender={n: pose for n, pose in poses.items() if pose})
         if ours is None or ours.found != common.found:
             return None
         if ours.objects == common.objects:
@@ -286,20 +288,36 @@ class CommonErrorFilter:
                 ours = ours.with_object(name, place_covariance(self._field, name))
         return own._replace(common=ours)
 
-    def own_pose_after(
-        self, own: OwnPose, state: State, accepted: Sequence[GatedObject]
-    ) -> OwnPose:
-        """The pose by own sensors after the objects of the map in a frame."""
+    def own_readings(self, accepted: Sequence[GatedObject]) -> list[Reading]:
+        """The readings of the objects of the map in a frame, for a pose by own sensors."""
         k = self._own_factor
-        readings = [r._replace(variance=k * r.variance) for r in _readings_of(accepted)]
-        return self._own_pose_with(own, state, readings)
+        return [r._replace(variance=k * r.variance) for r in _readings_of(accepted)]
 
-    def own_pose_observed(self, own: OwnPose, state: State, observation: Observation) -> OwnPose:
-        """The same after a reading of the position sensor about the estimate."""
-        parts = observation.noise(), _UNAFFECTED
-        return self._own_pose_with(own, state, independent_readings(observation, *parts))
+    def position_readings(self, observation: Observation) -> list[Reading]:
+        """The same of a reading of the position sensor."""
+        return independent_readings(observation, observation.noise(), _UNAFFECTED)
 
-    def _own_pose_with(self, own: OwnPose, state: State, readings: Sequence[Reading]) -> OwnPose:
+    def log_likelihood(self, own: OwnPose, state: State, readings: Sequence[Reading]) -> float:
+        """How likely own readings about the estimate are by this pose (`OwnPose`)."""
+        known, about = common_errors_of(state), state.estimate.pose
+        return own.log_likelihood_of(about, known, readings, self._learns_camera)
+
+    def with_report(
+        self, own: OwnPose, state: State, report: Observation, given: tuple[Sensitivity, ...]
+    ) -> OwnPose:
+        """The pose of a hypothesis after a report of its sender about that pose. `given`: the
+        sensitivities of a sighting, which is corrected by what the estimate knows."""
+        prior, common, known = own.estimate, own.common, common_errors_of(state)
+        assert common is not None
+        of_rows = given or _UNAFFECTED[: len(report.rows)]
+        values = tuple(b - a for a, b in zip(known.values, common.values, strict=True))
+        pairs = zip(report.residuals, of_rows, strict=True)
+        report = report._replace(residuals=tuple(e - sensitivity_dot(c, values) for e, c in pairs))
+        estimate, common = updated_by_teammate(prior, common, report, of_rows, self._splits)
+        return own._replace(estimate=estimate, common=common)
+
+    def own_pose_with(self, own: OwnPose, state: State, readings: Sequence[Reading]) -> OwnPose:
+        """The pose by own sensors after readings of them about the estimate."""
         if not readings:
             return own
         known = common_errors_of(state)

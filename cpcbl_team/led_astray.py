@@ -13,19 +13,23 @@ from typing import Final
 
 from msgspec.structs import replace
 
+from cpcbl_team.augmented_update import Reading
 from cpcbl_team.common_error_filter import CommonErrorFilter, common_errors_of
 from cpcbl_team.config import OdometrySettings
 from cpcbl_team.estimate import Estimate, Sums, pose_difference
-from cpcbl_team.fusion import Observation, mark_shared
+from cpcbl_team.fusion import Observation, mark_shared, merge_split
 from cpcbl_team.gaussian import Covariance2
-from cpcbl_team.mean_offsets import CONFLICT, CONFLICT_OF_MOST, FAST_COMMON_M
+from cpcbl_team.hypotheses import with_gains, with_hypotheses
+from cpcbl_team.mean_comparisons import CONFLICT_OF_MOST
+from cpcbl_team.mean_offsets import CONFLICT, FAST_COMMON_M
 from cpcbl_team.measurements import GatedObject
 from cpcbl_team.miscalibration import noise_with_factor
 from cpcbl_team.own_pose import LONGEST_NS, OwnPose
-from cpcbl_team.parameters import sensitivity_dot
+from cpcbl_team.parameters import Sensitivity, sensitivity_dot
 from cpcbl_team.recovery_evidence import without_senders
 from cpcbl_team.sender_comparisons import OWN_SENSORS, RECENT_NS, SenderRecords
 from cpcbl_team.sender_records import (
+    BY_COMPARISON,
     CONTRADICTING_NIS,
     SILENCE_NS,
     QuarantineReason,
@@ -39,7 +43,7 @@ from cpcbl_team.state import (
     with_memory,
     with_teammates,
 )
-from cpcbl_team.trust import BY_COMPARISON, reset_scores
+from cpcbl_team.trust import reset_scores
 
 GUESSED_NS: Final = 100_000_000  # odometry that is missing for longer does not only come late
 
@@ -58,29 +62,78 @@ class OwnPoses:
         """The state after a frame: what own sensors say of the offset of the estimate, as sums, or
         where these have errors in common as the `accepted` objects. The pose begins as the estimate
         when help comes first, and after a gap of the odometry."""
-        own = self._present(state)
+        own = self._present(state, with_hypotheses=True)
         if own is None:
-            own = self._new_own_pose(state)
-        elif self._common is not None:
-            own = self._common.own_pose_after(own, state, accepted)
+            return with_own_pose(state, self._new_own_pose(state))
+        readings = () if self._common is None else self._common.own_readings(accepted)
+        return self._updated(state, own, sums, readings)
+
+    def _updated(
+        self, state: State, own: OwnPose, sums: Sums, readings: Sequence[Reading]
+    ) -> State:
+        """The state after own readings about the estimate: as sums, or where they have errors in
+        common one by one. Each hypothesis is judged by how likely they are before it uses them."""
+        about, common = state.estimate.pose, self._common
+
+        def after(pose: OwnPose) -> OwnPose:
+            if common is None:
+                return pose.with_evidence(about, sums)
+            return common.own_pose_with(pose, state, readings)
+
+        def log_likelihood(pose: OwnPose) -> float:
+            if common is None:
+                return pose.log_likelihood(about, sums)
+            return common.log_likelihood(pose, state, readings)
+
+        teammates = state.memory.teammates
+        senders, by_sender = teammates.senders, own.by_sender
+        if by_sender:
+            before_ns = own.stamp_ns if teammates.own is None else teammates.own.stamp_ns
+            gains = {n: log_likelihood(pose) for n, pose in by_sender.items()}
+            gains[OWN_SENSORS] = log_likelihood(own)
+            senders = with_gains(senders, gains, before_ns, state.stamp_ns)
+            by_sender = {name: after(pose) for name, pose in by_sender.items()}
+        own = with_hypotheses(after(own)._replace(by_sender=by_sender), senders)
+        return with_teammates(state, teammates._replace(senders=senders, own=own))
+
+    def after_report(
+        self,
+        state: State,
+        sender: str,
+        observation: Observation,
+        least_sigma_m: float,
+        sensitivities: tuple[Sensitivity, ...] = (),
+    ) -> State:
+        """The state after a report about the estimate, with which the pose of its sender's
+        hypothesis is updated, if there is one. `least_sigma_m`: of the part of the noise that all
+        its reports have in common. `sensitivities`: to the errors that own sightings have in
+        common."""
+        own = state.memory.teammates.own
+        pose = None if own is None else own.by_sender.get(sender)
+        if own is None or pose is None or self._present(state) is None:
+            return state
+        pose = self._by_odometry(pose, state)
+        dependent = observation.dependent
+        more = max(0.0, least_sigma_m**2 - min(dependent.xx, dependent.yy))
+        observation = observation._replace(dependent=dependent + Covariance2(more, 0.0, more))
+        observation = observation.shifted(*pose_difference(state.estimate.pose, pose.estimate.pose))
+        if self._common is None:
+            pose = pose._replace(estimate=merge_split(pose.estimate, observation))
         else:
-            own = own.with_evidence(state.estimate.pose, sums)
-        return with_own_pose(state, own)
+            pose = self._common.with_report(pose, state, observation, sensitivities)
+        return with_own_pose(state, own._replace(by_sender={**own.by_sender, sender: pose}))
 
     def after_position(self, state: State, position: Observation, is_accepted: bool) -> State:
         """The state after a reading of the position sensor about the estimate, which has accepted
         it or not. Whether the pose by own sensors accepts it is another question: help may have led
         the estimate away."""
-        own = self._present(state)
+        own = self._present(state, with_hypotheses=True)
         if own is None:
             return with_own_pose(state, self._new_own_pose(state)) if is_accepted else state
         if _nis(own, state, position) > self._gate:
             return state
-        if self._common is not None:
-            own = self._common.own_pose_observed(own, state, position)
-        else:
-            own = own.with_evidence(state.estimate.pose, position.information())
-        return with_own_pose(state, own)
+        readings = () if self._common is None else self._common.position_readings(position)
+        return self._updated(state, own, position.information(), readings)
 
     def nis(self, state: State, observation: Observation) -> float:
         """How far a report contradicts the pose by own sensors, scaled to two degrees of freedom;
@@ -133,20 +186,25 @@ class OwnPoses:
             state = with_common_errors(state, own.common)
         return with_teammates(state, teammates._replace(senders=senders, own=own))
 
-    def _present(self, state: State) -> OwnPose | None:
-        """The pose by own sensors now, if there is one and it says anything."""
+    def _present(self, state: State, with_hypotheses: bool = False) -> OwnPose | None:
+        """The pose by own sensors now, if there is one and it says anything; perhaps those of the
+        hypotheses as well."""
         own, adaptation = state.memory.teammates.own, state.memory.calibration.adaptation
         if own is None or state.lost or own.adaptation != adaptation:
             return None
         is_old = state.stamp_ns - own.stamp_ns > LONGEST_NS
         if is_old or own.gaps != _gaps(state) or self.is_guessed(state):
             return None
-        noise = noise_with_factor(self._noise, adaptation.motion_factor)
-        scales = state.memory.calibration.scales
-        own = own.at(state.stamp_ns, state.odometry_from_robot, noise, scales)
+        own = self._by_odometry(own if with_hypotheses else own.alone, state)
         if not own.is_known:
             return None
         return own if self._common is None else self._common.own_pose_for(own, state)
+
+    def _by_odometry(self, own: OwnPose, state: State) -> OwnPose:
+        """A pose at the time of the state, by odometry."""
+        memory = state.memory.calibration
+        noise = noise_with_factor(self._noise, memory.adaptation.motion_factor)
+        return own.at(state.stamp_ns, state.odometry_from_robot, noise, memory.scales)
 
     def _new_own_pose(self, state: State) -> OwnPose:
         """The pose by own sensors where it begins: the estimate."""

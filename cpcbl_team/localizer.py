@@ -309,7 +309,7 @@ class Localizer:
             state, is_trusted = self.screen.screen_observation(state, observation, position, nis)
             if not is_trusted or state.estimate is not prior:
                 return self.recovery.check(state)
-            observation = self.screen.with_caution(state, observation)
+            observation, nis = self.screen.with_caution(state, observation, nis)
             position = observation.of_position(prior.pose)
         if nis > self._gates[1]:
             if self.screen.has_no_vote(state, observation):  # whether the robot is lost

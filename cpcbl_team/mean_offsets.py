@@ -23,26 +23,14 @@ FAST: Final = 0  # places of both means in a record
 SLOW: Final = 1
 LEAST_REPORTS: Final = 5.0  # with fewer, fading, a source has no mean
 MOST_SIGMA_M: Final = 0.15  # a source whose mean is less certain has no vote
-SURE_SIGMA_M: Final = 0.08  # own sensors that are less certain convict and doubt nobody alone
 FAST_COMMON_M: Final = 0.01
 SLOW_COMMON_M: Final = 0.01
 """Sigmas of what two correct sources may disagree by for ever: calibration, map, and the error of
 the estimate, which differs between the times of their reports, the more the longer the mean."""
 CONFLICT: Final = 18.0
 """Two sources contradict each other beyond this chi-square (two degrees of freedom)."""
-CONFLICT_OF_MOST: Final = 36.0
-"""The same between own sensors and most senders, if these say the same: it is less likely that so
-many are wrong than that own sensors err by chance."""
 ALTERNATING_NS: Final = 200_000_000  # between two sources whose reports alternate
 USUAL: Final = 6.0  # 95 % of correct sources differ by less (chi-square, two degrees of freedom)
-LEAD: Final = 7.0
-"""Of two that contradict each other one is clearly nearer to a third source by this difference of
-their chi-squares."""
-LEAD_ON_MOST: Final = 14.0
-"""The same if the other one says what most senders say."""
-NEARER: Final = 2.0
-"""Of two senders one is probably nearer to the robot's own sensors by this difference of their
-chi-squares."""
 HEADING_VARIANCE: Final = math.radians(5.0) ** 2
 """rad^2: the heading of an estimate that was led astray may be wrong by more than its variance."""
 NOTHING: Final = Covariance2(0.0, 0.0, 0.0)
@@ -295,98 +283,3 @@ def _growth(one: MeanOffset, other: MeanOffset) -> float:
     if later.stamp_ns - earlier.stamp_ns <= ALTERNATING_NS:
         return 0.0
     return max(0.0, later.estimate_variance - earlier.estimate_variance)
-
-
-class Comparison(NamedTuple):
-    """What the means of other sources say of that of one."""
-
-    bias_variance: float = 0.0  # m^2, that a report of it may have in common with all others of it
-    is_wrong: bool = False
-    is_contested: bool = False
-    """It contradicts others, and there is no majority for either side."""
-    is_confirmed: bool = False
-    """At least one other source agrees, and no majority contradicts."""
-    is_left_out: bool = False  # it is contested, and a rival is nearer to the robot's own sensors
-
-
-def both(fast: Comparison, slow: Comparison) -> Comparison:
-    """Both comparisons of one source, by its means of a short and of a long time. While it is
-    contested the longer ones that tell so decide whether it is used, for own sensors are noisy."""
-    contested = slow if slow.is_contested else fast
-    is_contested = contested.is_contested
-    return Comparison(
-        contested.bias_variance if is_contested else max(fast.bias_variance, slow.bias_variance),
-        fast.is_wrong or slow.is_wrong,
-        is_contested,
-        fast.is_confirmed and slow.is_confirmed,
-        contested.is_left_out,
-    )
-
-
-def compared_with_own_sensors(
-    mean: MeanOffset, own: MeanOffset, others: Means, heard: int = 0
-) -> Comparison:
-    """A sender beside the robot's own sensors, which outweigh any number of others. Where this one
-    and another contradict each other, they decide by which of both is clearly nearer to theirs.
-    `heard`: how many senders were heard lately, with this one and those in quarantine.
-
-    The bias of a sender is its distance from its doubters: own sensors that are sure, and every
-    other sender that is not clearly farther from these. How many others agree with it does not
-    matter. A contested sender is left out if a rival is nearer to the own sensors.
-    """
-    leads = [(other, lead(other, mean, own)) for other in others.values()]
-    friends, rivals = [], []
-    for other, ahead in leads:
-        if contradicts(mean, other):
-            rivals.append((other, ahead))
-        else:
-            friends.append(other)
-    doubters = [other for other, ahead in leads if ahead >= -NEARER]
-    is_sure = own.is_within(SURE_SIGMA_M)
-    if is_sure:
-        doubters.append(own)
-    bias = max((bias_variance(mean, doubter) for doubter in doubters), default=0.0)
-    apart = disagreement(mean, own) if is_sure else 0.0
-    is_doubted = apart > CONFLICT
-    number = max(heard, len(others) + 1)
-
-    def is_of_most(like_it: int) -> bool:
-        """Whether it and so many others, which own sensors are against as well, are most of all."""
-        return like_it > 0 and 2 * (like_it + 1) > number
-
-    is_refuted = apart > CONFLICT_OF_MOST or (
-        is_doubted and not is_of_most(sum(disagreement(f, own) > USUAL for f in friends))
-    )
-    is_behind = any(
-        ahead > LEAD_ON_MOST
-        or (ahead > LEAD and not is_of_most(sum(contradicts(rival, f) for f in friends)))
-        for rival, ahead in rivals
-    )
-    if is_refuted or is_behind:
-        return Comparison(bias, is_wrong=True)
-    is_contested = any(ahead >= -LEAD for _, ahead in rivals)
-    is_left_out = any(ahead > NEARER for _, ahead in rivals)
-    return Comparison(bias, False, is_contested, not (is_contested or is_doubted), is_left_out)
-
-
-def compared_with_majority(mean: MeanOffset, others: Means) -> Comparison:
-    """A sender beside the others. The bias is the distance within which a strict majority of all
-    agrees with it: with three, its own and one more; with four, its own and two more."""
-    count = len(others) + 1
-    if count == 1:
-        return Comparison()
-    needed = count // 2  # other means that make a strict majority with its own
-    apart = {name: disagreement(mean, other) for name, other in others.items()}
-    biases = sorted([bias_variance(mean, other, apart=apart[n]) for n, other in others.items()])
-    bias = biases[needed - 1]
-    accusers = {n: other for n, other in others.items() if apart[n] > CONFLICT}
-    if len(others) - len(accusers) >= needed:
-        return Comparison(bias, is_confirmed=True)
-    is_wrong = any(2 * (_agreeing(name, accusers) + 1) > count for name in accusers)
-    return Comparison(bias, is_wrong, not is_wrong)
-
-
-def _agreeing(name: str, others: Means) -> int:
-    """How many of the others agree with this one of them."""
-    mean = others[name]
-    return sum(not contradicts(mean, other) for n, other in others.items() if n != name)

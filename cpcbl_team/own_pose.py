@@ -11,13 +11,14 @@ apart from those beside the estimate: what is known of them there may come from 
 """
 
 import math
-from collections.abc import Iterable
-from typing import Final, NamedTuple
+from collections.abc import Iterable, Mapping
+from types import MappingProxyType
+from typing import Any, Final, NamedTuple
 
-from cpcbl_team.augmented_update import Reading, updated
+from cpcbl_team.augmented_update import Reading, ScoredUpdate, estimated_of, updated
 from cpcbl_team.common_errors import CommonErrors
 from cpcbl_team.config import OdometryNoise
-from cpcbl_team.estimate import Estimate, Sums, dot, merge, pose_difference
+from cpcbl_team.estimate import Covariance3, Estimate, Sums, dot, merge, pose_difference
 from cpcbl_team.geometry import Pose2
 from cpcbl_team.miscalibration import Adaptation
 from cpcbl_team.motion import NO_VARIANCE, MotionVariance, move
@@ -28,6 +29,8 @@ MOST_SIGMA_M: Final = 0.5  # a pose that is less certain, or its heading, is no 
 MOST_SIGMA_RAD: Final = math.radians(15.0)
 LONGEST_NS: Final = 3_000_000_000  # without own sensors: then it begins anew
 CORRELATION_S: Final = 3.0  # as long
+SMALLEST_RATIO: Final = 1e-30  # of determinants, against rounding
+NO_HYPOTHESES: Final[Mapping[str, Any]] = MappingProxyType({})
 
 
 class OwnPose(NamedTuple):
@@ -39,6 +42,9 @@ class OwnPose(NamedTuple):
     adaptation: Adaptation  # the settings with which it was found
     gaps: int  # of the odometry until then
     common: CommonErrors | None = None  # what own sensors say of the errors in all their readings
+    by_sender: "Mapping[str, OwnPose]" = NO_HYPOTHESES
+    """The same with the reports of one contested sender each (`hypotheses.py`)."""
+    contested_ns: int = 0  # when senders last contradicted each other
 
     @property
     def is_known(self) -> bool:
@@ -46,6 +52,11 @@ class OwnPose(NamedTuple):
         estimate = self.estimate
         is_placed = estimate.position_sigma_m <= MOST_SIGMA_M
         return is_placed and estimate.heading_sigma_rad <= MOST_SIGMA_RAD
+
+    @property
+    def alone(self) -> "OwnPose":
+        """Without the hypotheses."""
+        return self._replace(by_sender=NO_HYPOTHESES) if self.by_sender else self
 
     def at(
         self,
@@ -65,40 +76,81 @@ class OwnPose(NamedTuple):
         if common is not None:
             common = common.after_motion(self.estimate.pose.heading, distance, way.heading)
             common = common.after_time(seconds)
+        by_sender = self.by_sender
+        if by_sender:
+            by_sender = {
+                name: pose.at(stamp_ns, odometry_from_robot, noise, scales)
+                for name, pose in by_sender.items()
+            }
         return self._replace(
             stamp_ns=stamp_ns,
             estimate=moved,
             odometry_from_robot=odometry_from_robot,
             common=common,
+            by_sender=by_sender,
         )
 
     def with_evidence(self, about: Pose2, evidence: Sums) -> "OwnPose":
         """With what own sensors say of the offset of the robot from the pose `about`, at which they
         were linearized."""
+        return self._replace(estimate=merge(self.estimate, self._about_it(about, evidence)))
+
+    def log_likelihood(self, about: Pose2, evidence: Sums) -> float:
+        """How likely this evidence is by this pose, without the part that is the same for all
+        poses. The logarithm of the integral of the pose's Gaussian times the evidence's."""
+        matrix, vector = evidence
+        offset = pose_difference(about, self.estimate.pose)
+        prior = self.estimate.covariance
+        of_it = self._about_it(about, evidence)
+        after = merge(self.estimate, of_it).covariance
+        half = 0.5 * dot(Covariance3(*matrix).times(offset), offset)
+        gained = 0.5 * dot(of_it[1], after.times(of_it[1]))
+        ratio = max(after.determinant() / prior.determinant(), SMALLEST_RATIO)
+        return dot(vector, offset) - half + gained + 0.5 * math.log(ratio)
+
+    def _about_it(self, about: Pose2, evidence: Sums) -> Sums:
+        """The evidence of an offset from the pose `about` as that of an offset from this one."""
         (xx, xy, yy, xh, yh, hh), (x, y, h) = evidence
         dx, dy, dh = pose_difference(about, self.estimate.pose)
         x -= xx * dx + xy * dy + xh * dh
         y -= xy * dx + yy * dy + yh * dh
         h -= xh * dx + yh * dy + hh * dh
-        return self._replace(estimate=merge(self.estimate, (evidence[0], (x, y, h))))
+        return evidence[0], (x, y, h)
 
     def with_readings(
         self, about: Pose2, known: CommonErrors, readings: Iterable[Reading], with_camera: bool
     ) -> "OwnPose":
         """With readings of own sensors, which were linearized at the pose `about` and corrected by
         what is `known` of the errors that they have in common. `with_camera`: as in `updated`."""
+        of_own = self._readings_about_it(about, known, readings)
+        assert self.common is not None
+        estimate, common = updated(self.estimate, self.common, of_own, with_camera)
+        return self._replace(estimate=estimate, common=common)
+
+    def log_likelihood_of(
+        self, about: Pose2, known: CommonErrors, readings: Iterable[Reading], with_camera: bool
+    ) -> float:
+        """How likely these readings are by this pose, as in `log_likelihood`."""
+        common = self.common
+        assert common is not None
+        estimated = estimated_of(common, with_camera)
+        update = ScoredUpdate(self.estimate.covariance, common, estimated)
+        update.after(self._readings_about_it(about, known, readings))
+        return update.log_likelihood
+
+    def _readings_about_it(
+        self, about: Pose2, known: CommonErrors, readings: Iterable[Reading]
+    ) -> list[Reading]:
         common = self.common
         assert common is not None
         offset = pose_difference(about, self.estimate.pose)
         values = tuple(b - a for a, b in zip(known.values, common.values, strict=True))
-        of_own = [
+        return [
             r._replace(
                 residual=r.residual - dot(r.row, offset) - sensitivity_dot(r.sensitivity, values)
             )
             for r in readings
         ]
-        estimate, common = updated(self.estimate, common, of_own, with_camera)
-        return self._replace(estimate=estimate, common=common)
 
 
 def _of_scales(distance: float, turn: float, seconds: float, scales: ScaleErrors) -> MotionVariance:

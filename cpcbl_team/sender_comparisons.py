@@ -14,21 +14,20 @@ from typing import Final
 
 from msgspec.structs import replace
 
+from cpcbl_team.mean_comparisons import (
+    Comparison,
+    both,
+    compared_with_majority,
+    compared_with_own_sensors,
+)
 from cpcbl_team.mean_headings import NO_TURNS, FadingTurns, MeanTurn, contradicting
 from cpcbl_team.mean_offsets import (
     ALTERNATING_NS,
     FAST,
-    NOTHING,
     SLOW,
-    USUAL,
-    Comparison,
     MeanOffset,
-    both,
-    compared_with_majority,
-    compared_with_own_sensors,
     contradicts,
     disagreement,
-    lead,
 )
 from cpcbl_team.sender_records import NEVER_NS, SILENCE_NS, Rival, SenderRecord
 
@@ -52,34 +51,6 @@ def senders_with_a_say(senders: SenderRecords, name: str, now_ns: int) -> Sender
     """The recent senders that count in a dispute about a report of `name`."""
     silenced = {*doubted_guests(senders, now_ns)} - {name}
     return {n: r for n, r in recent_senders(senders, now_ns) if n not in silenced}
-
-
-def supporters_of_estimate(
-    recent: SenderRecords,
-    dissenters: Collection[str],
-    claims: Collection[tuple[float, float]],
-    began_ns: int,
-) -> set[str]:
-    """The sources that agreed with the estimate since a dispute began, and do not agree as well
-    with the `claims` of the senders that contradict it (offsets from the estimate, m)."""
-    return {
-        name
-        for name, r in recent.items()
-        if name not in dissenters
-        and r.last_agreement_ns > max(began_ns, r.dispute_since_ns)
-        and _denies(r, claims)
-    }
-
-
-def _denies(record: SenderRecord, claims: Collection[tuple[float, float]]) -> bool:
-    """Whether the mean of a source is nearer to the estimate than to these offsets from it, by more
-    than usual noise. A source that is too vague to tell agrees with both sides of a dispute. (A
-    source without a mean is believed by its single reports.)"""
-    mean = record.means[FAST]
-    if mean is None:
-        return True
-    estimate = MeanOffset(0.0, 0.0, NOTHING, stamp_ns=mean.stamp_ns)
-    return all(lead(estimate, estimate._replace(x=x, y=y), mean) > USUAL for x, y in claims)
 
 
 def members(senders: SenderRecords, names: Collection[str]) -> list[str]:
@@ -259,7 +230,7 @@ def _comparison_of(senders: SenderRecords, name: str, now_ns: int, of: int) -> C
     if record.offsets[of].stamp_ns != now_ns or mean is None or not mean.can_be_wrong:
         return None
     others = voting_means(senders, now_ns, name, of)
-    return _result(mean, others, _recent_count(senders, others, now_ns))
+    return _result(senders[name], mean, others, _recent_count(senders, others, now_ns))
 
 
 def _recent_count(senders: SenderRecords, voting: Collection[str], now_ns: int) -> int:
@@ -272,13 +243,15 @@ def _recent_count(senders: SenderRecords, voting: Collection[str], now_ns: int) 
     )
 
 
-def _result(mean: MeanOffset, others: Mapping[str, MeanOffset], heard: int) -> Comparison:
+def _result(
+    record: SenderRecord, mean: MeanOffset, others: Mapping[str, MeanOffset], heard: int
+) -> Comparison:
     """What the others say of a sender's mean: the robot's own sensors, or else the majority."""
-    own = others.get(OWN_SENSORS)
-    if own is None:
+    own, behind = others.get(OWN_SENSORS), record.behind
+    if own is None and not any(name in others for name in behind):
         return compared_with_majority(mean, others)
     of_senders = {name: other for name, other in others.items() if name != OWN_SENSORS}
-    return compared_with_own_sensors(mean, own, of_senders, heard)
+    return compared_with_own_sensors(mean, own, of_senders, heard, behind)
 
 
 def wrong_turn(senders: SenderRecords, name: str, now_ns: int) -> MeanTurn | None:
@@ -335,6 +308,7 @@ def _contradicted(senders: SenderRecords, name: str, now_ns: int) -> tuple[Rival
         for other, its in means.items():
             if other == OWN_SENSORS or not contradicts(mean, its):
                 continue
-            if not _result(its, {n: m for n, m in means.items() if n != other}, heard).is_wrong:
+            rest = {n: m for n, m in means.items() if n != other}
+            if not _result(senders[other], its, rest, heard).is_wrong:
                 found[other] = Rival(other, its.x - mean.x, its.y - mean.y)
     return tuple(found.values())

@@ -10,7 +10,9 @@ What follows from them, and from the mean of the reports (`mean_offsets.py`), is
 """
 
 import math
+from collections.abc import Mapping
 from enum import StrEnum
+from types import MappingProxyType
 from typing import Final, NamedTuple
 
 import msgspec
@@ -46,6 +48,7 @@ CLEAR_CONFLICTS = 0.5  # so many conflicts speak against a sender if one was jus
 REPEATED_CONFLICTS = 1.5  # and so many at any time: an old one alone may be chance
 JUST_BEFORE_NS: Final = 2_000_000_000
 NEVER_NS: Final = -(2**62)
+NO_EVIDENCE: Final[Mapping[str, float]] = MappingProxyType({})
 
 
 class QuarantineReason(StrEnum):
@@ -57,6 +60,14 @@ class QuarantineReason(StrEnum):
     OVERCONFIDENT = "overconfident"
     OUTVOTED = "outvoted"
     HEADING = "heading"
+
+
+# The reasons that rest on what other senders reported
+BY_COMPARISON: Final = (
+    QuarantineReason.BIASED,
+    QuarantineReason.OVERCONFIDENT,
+    QuarantineReason.OUTVOTED,
+)
 
 
 class ReportedPosition(NamedTuple):
@@ -117,6 +128,16 @@ class Rival(NamedTuple):
     y: float
 
 
+class Denial(NamedTuple):
+    """What a source says of a sender that contradicts the estimate, since a dispute with it began:
+    how much farther its reports are from there than from the estimate (a sum of differences of
+    chi-squares)."""
+
+    of: str
+    since_ns: int
+    chi_square: float
+
+
 class SenderRecord(msgspec.Struct, frozen=True, gc=False):
     """What the robot remembers of one sender."""
 
@@ -146,8 +167,12 @@ class SenderRecord(msgspec.Struct, frozen=True, gc=False):
     """m^2: of the error that its reports may have in common, by what others say."""
     rivals: tuple[Rival, ...] = ()
     """With whom it is in a contest, until that is decided: also while either is silent."""
+    denial: Denial | None = None  # of the sender that contradicts the estimate most
     wrong_ns: int = NEVER_NS  # since when others say without interruption that its mean is wrong
     own_nis: float = 0.0  # of its last report, against the pose by own sensors
+    behind: Mapping[str, float] = NO_EVIDENCE
+    """How much more likely other senders make the robot's own readings than this one does, where
+    they contradict it (`hypotheses.py`): differences of chi-squares, by name."""
     confirmed: int = 0  # reports beside which another source agreed with it
     is_guest: bool = False
     headings: FadingTurns = NO_TURNS  # that it reported
@@ -183,6 +208,8 @@ def without_comparisons(record: SenderRecord) -> SenderRecord:
         position=new.position,
         offsets=new.offsets,
         means=new.means,
+        behind=new.behind,
+        denial=new.denial,
         headings=new.headings,
         courses=new.courses,
     )

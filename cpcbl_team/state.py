@@ -15,6 +15,7 @@ from cpcbl_team.arcs import with_arc_width
 from cpcbl_team.calibration_doubt import with_doubt
 from cpcbl_team.calibration_memory import CalibrationMemory
 from cpcbl_team.common_errors import CommonErrors
+from cpcbl_team.compromises import with_contest
 from cpcbl_team.config import Field, Start
 from cpcbl_team.estimate import HEADING, POSE, POSITION, ZERO3, Covariance3, Estimate, Scope
 from cpcbl_team.geometry import Pose2, new, wrap_angle
@@ -206,6 +207,9 @@ class State(NamedTuple):
         estimate = with_arc_width(self.estimate) if mixture is None else mixture.whole()
         estimate = with_doubts(estimate, known.check)
         estimate = with_scales_doubted(estimate, known.scales)
+        teammates = self.memory.teammates
+        if teammates.own is not None and teammates.own.by_sender:
+            estimate = with_contest(estimate, teammates.senders, self.stamp_ns)
         return with_doubt(estimate, self.odometry_from_robot, known.filters, known.adaptation)
 
     @property

@@ -12,11 +12,13 @@ from msgspec.structs import replace
 
 from cpcbl_team import trust
 from cpcbl_team.common_error_filter import CommonErrorFilter
+from cpcbl_team.compromises import compromise, doubt_variance
 from cpcbl_team.config import LocalizationSettings
 from cpcbl_team.estimate import Covariance3, Information, Sums
 from cpcbl_team.fixes import PoseObservation
 from cpcbl_team.fusion import Observation
-from cpcbl_team.gaussian import Covariance2
+from cpcbl_team.gaussian import Covariance2, Gaussian2
+from cpcbl_team.hypotheses import at_compromise
 from cpcbl_team.inflation import inflate_by_offset, inflate_to
 from cpcbl_team.inputs import Belief, Input, LandmarkBelief, Position, Sightings
 from cpcbl_team.landmarks import LandmarkUpdate
@@ -134,6 +136,8 @@ class TeammateScreen:
             report = TeammateReport(now, of_two, evidence=evidence, is_guest=self._is_guest(sender))
             if first.observation:
                 report = report._replace(own_nis=self.own.nis_of_sighting(state, first))
+                of_first = first.observation, self._rules.least_sigma_m, first.sensitivities
+                state = self.own.after_report(state, sender, *of_first)
             state, is_trusted = self._assess(state, sender, report, first.measurement.source)
             if not is_trusted:
                 distrusted.add(sender)
@@ -149,8 +153,11 @@ class TeammateScreen:
         if not m.sender:
             return found
         covariance = self.cautious(state, m.sender, m.position.covariance)
-        if covariance is not m.position.covariance:
-            m = replace(m, position=m.position._replace(covariance=covariance))
+        between = compromise(state.memory.teammates.senders, m.sender)
+        if between is not None or covariance is not m.position.covariance:
+            x, y = (0.0, 0.0) if between is None else (between.x, between.y)
+            position = Gaussian2(m.position.x + x, m.position.y + y, covariance)
+            m = replace(m, position=position)
         return found._replace(
             measurement=m, observation=observation_of(state.estimate, m, found.constraints)
         )
@@ -167,12 +174,16 @@ class TeammateScreen:
         report = TeammateReport(state.stamp_ns, nis, is_guest=self._is_guest(belief.robot))
         return self._assess(state, belief.robot, report, belief.landmark)
 
-    def with_caution(self, state: State, observation: PoseObservation) -> PoseObservation:
-        """A teammate's fix, with the observer's part of its covariance increased by `cautious`."""
+    def with_caution(
+        self, state: State, observation: PoseObservation, nis: float
+    ) -> tuple[PoseObservation, float]:
+        """A teammate's fix, with the observer's part of its covariance increased by `cautious`, at
+        the compromise between it and its opponents, and its NIS there."""
         if observation.observer is None:
-            return observation
+            return observation, nis
         observer = self.cautious(state, observation.sender, observation.observer)
-        return observation._replace(observer=observer)
+        observation, nis = at_compromise(state, observation, nis)
+        return observation._replace(observer=observer), nis
 
     def cautious(self, state: State, sender: str, dependent: Covariance2) -> Covariance2:
         """The part of a teammate's covariance that is the same in all its reports, increased to the
@@ -185,10 +196,11 @@ class TeammateScreen:
         is_new_guest = is_new and self._is_guest(sender)
         least = (rules.guest_sigma_m if is_new_guest else rules.least_sigma_m) ** 2
         more = max(0.0, least - min(dependent.xx, dependent.yy))
-        if record is not None:
-            more += max(
-                record.bias_variance, contest_m(state.memory.teammates.senders, sender) ** 2
-            )
+        senders = state.memory.teammates.senders
+        if record is not None and record.behind:
+            more += doubt_variance(senders, sender)
+        if record is not None and compromise(senders, sender) is None:
+            more += max(record.bias_variance, contest_m(senders, sender) ** 2)
         return dependent + Covariance2(more, 0.0, more) if more else dependent
 
     def has_no_vote(self, state: State, observation: PoseObservation) -> bool:
@@ -227,6 +239,7 @@ class TeammateScreen:
                 state = self._with_own_sensors(state, is_accepted, not is_accepted, own)
                 state = self.own.after_position(state, position, is_accepted)
             return state, True
+        _, nis = at_compromise(state, observation, nis)
         heading, of_heading = observation.of_heading(state.estimate.pose), None
         if heading is not None:  # three degrees of freedom, scaled to two
             nis += heading.normalized_innovation_squared(state.estimate.covariance)
@@ -247,6 +260,8 @@ class TeammateScreen:
             of_heading,
             self.own.nis(state, position),
         )
+        of_it = observation.sender, position, self._rules.least_sigma_m
+        state = self.own.after_report(state, *of_it)
         return self._assess(state, observation.sender, report, observation.source)
 
     def is_changed_by_beliefs(self, item: Input, before: State, after: State, robot: str) -> bool:

@@ -21,8 +21,12 @@ from typing import Final, NamedTuple
 
 from msgspec.structs import replace
 
+from cpcbl_team.compromises import compromise
 from cpcbl_team.config import TrustSettings
-from cpcbl_team.mean_offsets import FAST, Comparison, disagreement
+from cpcbl_team.disputes import supporters_of_estimate, with_denial
+from cpcbl_team.mean_comparisons import EVIDENCE_ON_MOST, Comparison
+from cpcbl_team.mean_offsets import FAST, disagreement
+from cpcbl_team.overturned_quarantines import outvoted_majority, witnesses_of_contest
 from cpcbl_team.sender_comparisons import (
     OWN_SENSORS,
     RECENT_NS,
@@ -35,13 +39,13 @@ from cpcbl_team.sender_comparisons import (
     recent_senders,
     rival_of,
     senders_with_a_say,
-    supporters_of_estimate,
     votes,
     voting_means,
     with_comparison,
     wrong_turn,
 )
 from cpcbl_team.sender_records import (
+    BY_COMPARISON,
     CONTRADICTING_NIS,
     JUMP_SIGMAS,
     MOST_NIS,
@@ -67,12 +71,7 @@ MOST_CONFLICTS = 2.5  # with more a sender is quarantined: at the third within a
 LEAST_AGREEMENTS = 10  # reports that must agree with the estimate before a sender is readmitted,
 LEAST_CONFIRMATIONS = 2  # or distances that must agree with odometry
 PERSISTENCE_NS: Final = 500_000_000  # a mean that is wrong for so long is no chance
-ALIKE_M: Final = 0.05  # two senders whose offsets differ by no more, or by half of them, agree
 LEAST_UNITED: Final = 2  # teammates that agree with each other against the estimate
-MAJORITY_NS: Final = 20_000_000_000  # most senders are not found wrong within so short a time
-
-# The reasons that rest on what other senders reported
-BY_COMPARISON = QuarantineReason.BIASED, QuarantineReason.OVERCONFIDENT, QuarantineReason.OUTVOTED
 
 
 class TrustDecision(NamedTuple):
@@ -122,11 +121,18 @@ def assess(
     """The records after a report of the sender `name`, and whether the report may be used.
     `used_ns`: when a report of this sender was last used."""
     decision = _decide(senders, name, report, used_ns, rules)
-    out = _outvoted_majority(decision, report.stamp_ns) if decision.quarantined else None
+    now_ns, found = report.stamp_ns, decision.quarantined
+    out = outvoted_majority(decision.senders, found, now_ns) if found else None
     if out:
-        decision = _without_decision(decision, out, report.stamp_ns)
-    least_m = max(decision.least_sigma_m, contest_m(decision.senders, name))
-    is_used = decision.trusted and not is_left_out_guest(decision.senders, name, report.stamp_ns)
+        decision = _without_decision(decision, out, now_ns)
+    witnesses = witnesses_of_contest(decision.senders, name, now_ns)
+    if witnesses:
+        heard = {n: released(decision.senders[n], now_ns) for n in witnesses}
+        decision = decision._replace(senders={**decision.senders, **heard}, event="readmitted")
+    senders, between = decision.senders, compromise(decision.senders, name)
+    least_m = 0.0 if between else max(decision.least_sigma_m, contest_m(senders, name))
+    is_used = decision.trusted and not (between and between.is_outweighed)
+    is_used = is_used and not is_left_out_guest(senders, name, report.stamp_ns)
     return decision._replace(trusted=is_used, least_sigma_m=least_m)
 
 
@@ -136,6 +142,8 @@ def _decide(
     """The decision that the tests of one report lead to."""
     now = report.stamp_ns
     record = with_report(senders.get(name, SenderRecord()), report, rules.limit)
+    senders = {**senders, name: record}
+    record = with_denial(senders, name, report.evidence, now)
     senders = {**senders, name: record}
     comparison = compare(senders, name, now)
     if comparison is not None:
@@ -191,12 +199,12 @@ def _decide_dispute(
         return TrustDecision(senders, True)
     began_ns = min(disputes_ns)
     dissenters = {n for n, r in recent.items() if r.score > 0.5 * rules.limit}
-    claims = [r.mean_offset for r in recent.values() if r.score > rules.limit]
-    supporters = supporters_of_estimate(recent, dissenters, claims, began_ns)
+    supporters = supporters_of_estimate(recent, dissenters, rules.limit, began_ns)
     if not supporters:
         return TrustDecision(senders, True)
-    if any(r.name in supporters for n in dissenters for r in open_rivals(senders, n)):
-        return TrustDecision(senders, True)
+    rivals = {r.name for n in dissenters for r in open_rivals(senders, n)}
+    if not rivals.isdisjoint(supporters) or any(_is_open(senders[n]) for n in dissenters):
+        return TrustDecision(senders, True)  # they are compared by other tests
     is_only_of_team = not members(recent, supporters) and len(members(recent, dissenters)) == 1
     if is_only_of_team and OWN_SENSORS not in dissenters | supporters:
         return _without_decision(TrustDecision(senders, True), dissenters, now_ns)
@@ -230,15 +238,18 @@ def _is_estimate_right(
     return True if now_ns - began_ns >= TIE_NS else None
 
 
+def _is_open(record: SenderRecord) -> bool:
+    """Whether own readings are compared with what this sender reports, and do not speak clearly
+    against it."""
+    return bool(record.behind) and max(record.behind.values()) <= EVIDENCE_ON_MOST
+
+
 def _is_odometry_wrong(senders: SenderRecords, name: str, rules: TrustSettings) -> bool:
     """Whether another source contradicts odometry too, so that `name` is not to blame."""
     return any(
         r.odometry_conflicts >= 1.0 or (other == OWN_SENSORS and r.score > 0.5 * rules.limit)
         for other, r in recent_senders(senders, senders[name].last_report_ns, name)
     )
-
-
-# Quarantine ---------------------------------------------------------------------------------------
 
 
 def _quarantine(senders: SenderRecords, name: str, now_ns: int, used_ns: int) -> TrustDecision:
@@ -264,24 +275,6 @@ def _quarantine_supporters(
     changed = {n: quarantined(senders[n], QuarantineReason.OUTVOTED, now_ns) for n in names}
     changed = {**senders, **changed, **{n: replace(senders[n], score=0.0) for n in dissenters}}
     return TrustDecision(changed, name not in names, "outvoted", names, max(errors_m))
-
-
-def _outvoted_majority(decision: TrustDecision, now_ns: int) -> frozenset[str]:
-    """The senders that were quarantined lately, and that agree with those that are now, if they are
-    half or more of three or more senders while the robot's own sensors say nothing; else none."""
-    recent = {n: r for n, r in decision.senders.items() if now_ns - r.last_report_ns <= RECENT_NS}
-    if OWN_SENSORS in recent or votes(recent, recent, recent) < 3:
-        return frozenset()
-    new = [recent[n].mean_offset for n in decision.quarantined if n in recent]
-    out = frozenset(
-        n
-        for n, r in recent.items()
-        if r.reason in BY_COMPARISON
-        and now_ns - r.since_ns <= MAJORITY_NS
-        and all(math.dist(r.mean_offset, o) <= ALIKE_M + 0.5 * math.hypot(*o) for o in new)
-    )
-    is_half = 2 * votes(recent, out, recent) >= votes(recent, recent, recent)
-    return out if is_half else frozenset()
 
 
 def _without_decision(decision: TrustDecision, side: Collection[str], now_ns: int) -> TrustDecision:

@@ -11,19 +11,21 @@ from hypothesis import strategies as st
 from cpcbl_team.estimate import Covariance3, Information
 from cpcbl_team.fusion import Observation
 from cpcbl_team.gaussian import Covariance2
+from cpcbl_team.mean_comparisons import (
+    LEAD,
+    Comparison,
+    both,
+    compared_with_majority,
+    compared_with_own_sensors,
+)
 from cpcbl_team.mean_offsets import (
     CONFLICT,
-    LEAD,
     NOTHING,
     SLOW_NS,
-    Comparison,
     FadingOffsets,
     MeanOffset,
     bias_variance,
-    both,
     by_whole_noise,
-    compared_with_majority,
-    compared_with_own_sensors,
     disagreement,
     lead,
     with_heading_error,

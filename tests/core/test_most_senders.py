@@ -3,7 +3,8 @@
 import pytest
 
 from cpcbl_team.gaussian import Covariance2
-from cpcbl_team.mean_offsets import MeanOffset, compared_with_own_sensors
+from cpcbl_team.mean_comparisons import compared_with_own_sensors
+from cpcbl_team.mean_offsets import MeanOffset
 
 
 def at(x: float, y: float = 0.0, sigma: float = 0.01) -> MeanOffset:

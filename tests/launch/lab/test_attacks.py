@@ -112,6 +112,18 @@ def test_those_who_echo_its_own_pose_lead_no_robot_with_eyes_astray() -> None:
 
 
 @pytest.mark.thorough
+@pytest.mark.parametrize("seed", [1, 10])
+def test_an_echo_leads_no_blind_robot_astray_beside_two_correct_observers(seed: int) -> None:
+    """It held the estimate back for half a second. One correct observer was too vague to say so,
+    counted as one that agrees, and the other one came into quarantine (ratios of 3.0 and 4.6)."""
+    attack = replace(EVERY["echo", "scout"], end_s=40.0)
+    _, row = rows_of([attack], [seed])
+    assert row.worst_ratio < attacks.BLIND_RATIO
+    assert row.false_quarantines == 0
+    assert row.least_inside_3_sigma > 0.97
+
+
+@pytest.mark.thorough
 def test_the_runs_to_compare_with_have_no_liar(short: dict[tuple[str, str], AttackRow]) -> None:
     for key in (("", "scout"), ("", "navigator")):
         assert short[key].worst_ratio == 1.0
@@ -153,6 +165,15 @@ def test_two_liars_are_no_majority_while_a_correct_observer_does_not_see_the_nav
     (row,) = rows_of([EVERY[name, "navigator"]], [401])[1:]
     assert row.worst_ratio < 1.4  # 1.47 and 1.64 before
     assert row.least_inside_3_sigma > 0.97
+
+
+@pytest.mark.thorough
+def test_two_liars_of_four_mislead_no_robot_with_eyes_for_long() -> None:
+    """Own readings decide between two sides that the estimate follows both."""
+    _, row = rows_of([EVERY["overclaimed", "navigator"]], [1])
+    assert row.held  # 1.57 before
+    assert row.least_inside_3_sigma > 0.97
+    assert row.false_quarantines == 0
 
 
 @pytest.mark.thorough

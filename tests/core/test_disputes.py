@@ -1,0 +1,103 @@
+"""Who supports the estimate in a dispute: by what a source reports since the dispute began."""
+
+import math
+
+import pytest
+from msgspec.structs import replace
+from support.core import SECOND
+
+from cpcbl_team.disputes import supporters_of_estimate, with_denial
+from cpcbl_team.estimate import Covariance3
+from cpcbl_team.gaussian import Covariance2
+from cpcbl_team.mean_offsets import USUAL, MeanOffset
+from cpcbl_team.sender_records import (
+    OffsetEvidence,
+    QuarantineReason,
+    SenderRecord,
+    without_comparisons,
+)
+
+NOW_NS = 100 * SECOND
+BEGAN_NS = NOW_NS - SECOND // 2
+CLAIM_M = 0.2
+LIMIT = 30.0
+DISSENTER = SenderRecord(
+    NOW_NS, score=LIMIT + 1.0, dispute_since_ns=BEGAN_NS, mean_offset=(CLAIM_M, 0.0)
+)
+
+
+def report(x: float, sigma_m: float, dependent_m: float = 0.0) -> OffsetEvidence:
+    """A report that the estimate is off by so much in x."""
+    a, d = 1.0 / sigma_m**2, dependent_m**2
+    matrix = Covariance3(a, 0.0, a, 0.0, 0.0, 0.0)
+    return OffsetEvidence((matrix, (a * x, 0.0, 0.0)), Covariance2(d, 0.0, d))
+
+
+def source(*offsets: float, sigma_m: float = 0.07, mean_m: float | None = None) -> SenderRecord:
+    """A source that has reported these offsets since the dispute began, and agreed then. Its mean
+    of some seconds is `mean_m`, if it has one."""
+    mean = None
+    if mean_m is not None:
+        mean = MeanOffset(mean_m, 0.0, Covariance2(1e-4, 0.0, 1e-4), stamp_ns=NOW_NS)
+    record = SenderRecord(NOW_NS, last_agreement_ns=NOW_NS, means=(mean, mean))
+    for x in offsets:
+        senders = {"dissenter": DISSENTER, "other": record}
+        record = with_denial(senders, "other", report(x, sigma_m), NOW_NS)
+    return record
+
+
+def supports(record: SenderRecord) -> bool:
+    recent = {"dissenter": DISSENTER, "other": record}
+    return supporters_of_estimate(recent, {"dissenter"}, LIMIT, BEGAN_NS) == {"other"}
+
+
+def test_a_denial_is_the_difference_of_chi_squares() -> None:
+    """By the whole noise of each report: its own part, and that which is the same in all."""
+    sigma_m, dependent_m = 0.03, 0.04  # 0.05 together
+    senders = {"dissenter": DISSENTER, "other": SenderRecord(NOW_NS)}
+    record = with_denial(senders, "other", report(0.05, sigma_m, dependent_m), NOW_NS)
+    expected = (0.15 / 0.05) ** 2 - (0.05 / 0.05) ** 2
+    assert record.denial is not None
+    assert record.denial[:2] == ("dissenter", BEGAN_NS)
+    assert record.denial.chi_square == pytest.approx(expected)
+
+
+def test_one_that_agreed_before_the_estimate_was_led_away_does_not_support_it() -> None:
+    """Its mean of some seconds agrees still, and each report is too vague to contradict: it was
+    counted against the one that was precise and right."""
+    led_away = source(0.14, 0.16, 0.05, 0.15, mean_m=0.0)
+    assert not supports(led_away)
+    assert supports(replace(led_away, denial=None))  # by that mean
+    assert supports(source(0.01, -0.05, 0.03, mean_m=0.0))
+
+
+@pytest.mark.parametrize(("sigma_m", "is_told"), [(0.05, True), (0.2, False)])
+def test_one_that_is_too_vague_to_tell_supports_nobody(sigma_m: float, is_told: bool) -> None:
+    assert supports(source(0.0, sigma_m=sigma_m)) is is_told
+    assert (CLAIM_M / sigma_m) ** 2 > USUAL if is_told else (CLAIM_M / sigma_m) ** 2 < USUAL
+
+
+def test_each_dispute_begins_anew() -> None:
+    told = source(0.0, 0.0)
+    assert told.denial is not None
+    evidence = report(0.0, 0.07)
+    later = replace(DISSENTER, dispute_since_ns=NOW_NS)
+    again = with_denial({"dissenter": later, "other": told}, "other", evidence, NOW_NS).denial
+    assert again is not None
+    assert again.chi_square == pytest.approx(told.denial.chi_square / 2.0)
+    louder = {"dissenter": DISSENTER, "x": replace(DISSENTER, score=2.0 * LIMIT), "other": told}
+    assert math.isclose(again.chi_square, (CLAIM_M / 0.07) ** 2)
+    found = with_denial(louder, "other", evidence, NOW_NS).denial
+    assert found is not None
+    assert found.of == "x"
+    none = {"dissenter": replace(DISSENTER, score=0.0), "other": told}
+    assert with_denial(none, "other", evidence, NOW_NS).denial is None
+    assert without_comparisons(told).denial is None
+
+
+def test_nobody_denies_itself_or_one_in_quarantine() -> None:
+    evidence = report(0.0, 0.02)
+    senders = {"dissenter": DISSENTER, "other": SenderRecord(NOW_NS)}
+    assert with_denial(senders, "dissenter", evidence, NOW_NS).denial is None
+    senders["dissenter"] = replace(DISSENTER, reason=QuarantineReason.BIASED)
+    assert with_denial(senders, "other", evidence, NOW_NS).denial is None
