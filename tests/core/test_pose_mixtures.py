@@ -79,7 +79,7 @@ def scored(rows: list[tuple[State, Pose2]]) -> Score:
     return score(Samples(estimates, np.array([truth for _, truth in rows]), covariances))
 
 
-@over_seeds(8, 60)
+@over_seeds(4, 60, 8)
 @pytest.mark.parametrize(
     ("landmarks", "sigma_m", "sigma_deg", "blind_m"),
     [
