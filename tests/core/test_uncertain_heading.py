@@ -110,7 +110,7 @@ def scored(runs: list[Drive], first: int, last: int) -> Score:
     return score(Samples(estimates, np.array([truth for _, truth in rows]), covariances))
 
 
-@over_seeds(5, 60, 12)
+@over_seeds(12, 60)
 @pytest.mark.parametrize("sigma_deg", sampled([10.0, 20.0, 45.0], [45.0]))
 @pytest.mark.parametrize(
     "landmarks",
@@ -141,10 +141,14 @@ def test_it_is_as_certain_as_it_may_be_before_and_after(
     assert np.mean([bool(state.lost) for state in seen]) < 0.02
 
 
-@over_seeds(3, 60, 6)
+@over_seeds(6, 60)
 @pytest.mark.parametrize(
     ("post", "share", "bearing_deg"),
-    [((1.0, 1.0), 0.05, 5.0), ((1.0, 1.0), 0.01, 1.0), ((4.0, 3.0), 0.05, 5.0)],
+    [
+        thorough((1.0, 1.0), 0.05, 5.0),
+        thorough((1.0, 1.0), 0.01, 1.0),
+        ((4.0, 3.0), 0.05, 5.0),
+    ],
     ids=["beside the circle", "precise", "in its centre"],
 )
 def test_many_frames_make_no_certainty_of_a_turn_about_the_only_landmark(
