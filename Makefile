@@ -51,9 +51,10 @@ $(VENV)/compiled-tests: $(VENV)/ready
 	@$(BIN)/pytest --collect-only -q > /dev/null 2>&1 || true  # what is wrong, the next run says
 	@touch $@
 
-# More worlds, seeds, images and attacks than `make test` samples, with the same bounds.
+# More worlds, seeds, images and attacks than `make test` samples, with the same bounds, and four times
+# the examples of properties.
 test-thorough: setup
-	$(BIN)/pytest -n 2 --dist worksteal -m "thorough and not long"
+	$(BIN)/pytest -n 2 --dist worksteal --hypothesis-profile thorough -m "(thorough or hypothesis) and not long"
 
 USUAL = not thorough and not long and not log and not pictures and not docker and not trial and not ros2 and not recordings
 

@@ -23,8 +23,11 @@ REAL = {
     "running",
 }
 
-settings.register_profile("untimed", deadline=None, suppress_health_check=[HealthCheck.too_slow])
-settings.load_profile("untimed")
+settings.register_profile(
+    "usual", max_examples=50, deadline=None, suppress_health_check=[HealthCheck.too_slow]
+)
+settings.register_profile("thorough", settings.get_profile("usual"), max_examples=200)
+settings.load_profile("usual")  # `make test-thorough` chooses the other one
 
 
 def pytest_configure() -> None:

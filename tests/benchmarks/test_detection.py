@@ -275,6 +275,7 @@ def test_the_number_of_jobs_changes_no_figure() -> None:
     assert replace(one, cost={}) == replace(two, cost={})
 
 
+@pytest.mark.thorough
 def test_the_benchmark_shows_targets_and_writes_json_and_picture(tmp_path: Path) -> None:
     done = run_benchmark("detection", "--frames", 6, "--jobs", 1, "--output", tmp_path)
     assert done.returncode == 0, done.stderr

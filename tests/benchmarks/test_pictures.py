@@ -78,6 +78,7 @@ def test_unexpected_detections_are_in_the_same_order_each_time(own_set: Path) ->
     assert found == (("both.png", "mark"), ("both.png", "mate"))
 
 
+@pytest.mark.thorough
 def test_the_benchmark_shows_and_writes(own_set: Path, tmp_path: Path) -> None:
     shown = run_benchmark("pictures", own_set, own_set.parent, "--output", tmp_path)
     assert shown.returncode == 0, shown.stderr

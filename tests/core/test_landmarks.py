@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from support.core import (
     CORNERS,
@@ -160,7 +160,6 @@ def composed(robot: Localizer, state: State, frame: Sightings) -> tuple[Estimate
     return with_circular_position(after) if r.variant == "circular" else after, counts
 
 
-@settings(max_examples=200)
 @given(fields, readings, sensors, rules, st.integers(0, 2**32 - 1))
 def test_a_frame_gives_the_evidence_of_its_constraints_one_by_one(
     field: Field,

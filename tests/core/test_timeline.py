@@ -131,7 +131,7 @@ def test_any_order_within_the_horizon_gives_the_same_state(
         assert same(late.latest(now), in_order.latest(now))
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", sampled(range(3), [0]))
 def test_a_long_run_with_delays_gives_the_same_state(seed: int) -> None:
     """The run is longer than the horizon. Each kind of input has its own delay."""
     rng, robot, inputs = np.random.default_rng(seed), localizer("joint", MIXED), history(8.0)

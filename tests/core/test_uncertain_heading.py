@@ -144,7 +144,11 @@ def test_it_is_as_certain_as_it_may_be_before_and_after(
 @over_seeds(6, 60)
 @pytest.mark.parametrize(
     ("post", "share", "bearing_deg"),
-    [((1.0, 1.0), 0.05, 5.0), ((1.0, 1.0), 0.01, 1.0), ((4.0, 3.0), 0.05, 5.0)],
+    [
+        thorough((1.0, 1.0), 0.05, 5.0),
+        thorough((1.0, 1.0), 0.01, 1.0),
+        ((4.0, 3.0), 0.05, 5.0),
+    ],
     ids=["beside the circle", "precise", "in its centre"],
 )
 def test_many_frames_make_no_certainty_of_a_turn_about_the_only_landmark(

@@ -205,7 +205,7 @@ def test_up_reports_to_file_and_standard_output(tmp_path: Path) -> None:
     team, written = tmp_path / "team.toml", tmp_path / "report.json"
     team.write_text(PAIR)
     ran = patient_up(
-        *(team, "--duration", 20, "--speed", 4, "--seed", 5, "--json", "--report", written)
+        *(team, "--duration", 12, "--speed", 4, "--seed", 5, "--json", "--report", written)
     )
     assert ran.returncode == 0, ran.stderr
     report = json.loads(ran.stdout)
@@ -233,6 +233,7 @@ def test_ctrl_c_ends_a_run_with_its_report_and_leaves_no_process(tmp_path: Path)
     assert not pids_of([str(tmp_path / "logs")])
 
 
+@pytest.mark.thorough
 def test_up_on_a_log_agrees_with_evaluate(tmp_path: Path) -> None:
     write_log(tmp_path, ("1", "2"), seconds=40.0)
     evaluated = command_line("evaluate", PLAIN, tmp_path, "--blind", "2", "--json")

@@ -50,7 +50,7 @@ WORK = {
 }
 
 
-@pytest.mark.parametrize("work", sampled(WORK, ["a team file", "an input as JSON"]))
+@pytest.mark.parametrize("work", sampled(WORK, ["an input as JSON"]))
 def test_threads_that_meet_a_type_at_once_get_the_same(work: str) -> None:
     imports, expression = WORK[work]
     program = PROGRAM.format(imports=imports, expression=expression)

@@ -4,7 +4,7 @@ import ast
 from collections.abc import Iterator
 
 Definition = ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef
-HOLDERS = ast.stmt | ast.excepthandler | ast.match_case  # what statements can be in
+PARTS = ("body", "orelse", "handlers", "finalbody", "cases")  # of what can hold statements
 
 
 def definitions(text: str) -> Iterator[Definition]:
@@ -12,6 +12,7 @@ def definitions(text: str) -> Iterator[Definition]:
     none is looked into."""
     nodes: list[ast.AST] = [ast.parse(text)]
     for node in nodes:  # the list grows meanwhile
-        nodes += [child for child in ast.iter_child_nodes(node) if isinstance(child, HOLDERS)]
+        for part in PARTS:
+            nodes += getattr(node, part, ())
         if isinstance(node, Definition):
             yield node

@@ -251,7 +251,7 @@ def test_a_narrow_view_does_not_tell_the_yaw_from_the_principal_point(errors: Ca
 
 
 @pytest.mark.parametrize("errors", [YAW, CENTRE, CameraErrors(-YAW.yaw_rad, 0.0, 0.05)], ids=str)
-@pytest.mark.parametrize("half_view_deg", sampled([6.0, 10.0, 15.0, 39.0], [10.0, 39.0]))
+@pytest.mark.parametrize("half_view_deg", sampled([6.0, 10.0, 15.0, 39.0], [10.0]))
 def test_what_is_named_is_never_the_wrong_one(errors: CameraErrors, half_view_deg: float) -> None:
     for seed in range(2):
         correction, _ = run(Drive(errors, half_view_deg=half_view_deg, seconds=60.0), seed)

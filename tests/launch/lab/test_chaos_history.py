@@ -19,6 +19,7 @@ from support.chaos import (
     unmet_checks,
 )
 from support.processes import command_line
+from support.sweeps import thorough
 
 from cpcbl_launch.lab.chaos.checks import Check, Outcome, at_most, equal_to, excused_by_load
 from cpcbl_launch.lab.chaos.consistency import (
@@ -185,7 +186,7 @@ def test_a_consistent_robot_is_within_its_bounds_and_a_bold_one_is_not() -> None
 
 @pytest.mark.parametrize(
     ("fusion", "seed"),
-    [("split-ci", 1), pytest.param("split-ci", 2, marks=pytest.mark.thorough), ("naive", 1)],
+    [thorough("split-ci", 1), thorough("split-ci", 2), ("naive", 1)],
 )
 def test_a_rumour_shows_naive_fusion_and_no_other(fusion: str, seed: int) -> None:
     (rumour,) = select_scenarios(["rumour"])

@@ -82,6 +82,7 @@ def test_an_experiment_writes_json_and_picture_and_shows_a_table(
     assert (folder / f"{name}.png").read_bytes().startswith(PNG)
 
 
+@pytest.mark.thorough
 def test_as_json_prints_what_is_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     conduct(
         small(EVERY["one-way-vs-both"]), seeds=1, where=Workers(1), output=tmp_path, as_json=True

@@ -57,18 +57,12 @@ def test_a_usual_history_holds_and_its_outcome_can_be_sent() -> None:
 
 
 def test_the_digest_does_not_depend_on_the_hash_seed() -> None:
-    digests = set()
-    for hash_seed in ("1", "2"):
-        environment = {
-            **os.environ,
-            "PYTHONHASHSEED": hash_seed,
-            "PYTHONPATH": os.pathsep.join(sys.path),
-        }
-        done = subprocess.run(
-            [sys.executable, "-c", DIGEST], env=environment, capture_output=True, check=True
-        )
-        digests.add(done.stdout)
-    assert len(digests) == 1
+    """That of this process is random."""
+    environment = {**os.environ, "PYTHONHASHSEED": "1", "PYTHONPATH": os.pathsep.join(sys.path)}
+    done = subprocess.run(
+        [sys.executable, "-c", DIGEST], env=environment, capture_output=True, check=True, text=True
+    )
+    assert done.stdout.strip() == run_seed(4, 8.0).digest
 
 
 @pytest.mark.parametrize("bug", sampled(FOUND, ["ordering"]))

@@ -26,7 +26,7 @@ def mapped_world(world: World, known: tuple[str, ...] = KNOWN, start: str = "") 
 
 @pytest.mark.parametrize(
     ("robots", "days", "blind"),
-    [thorough(1, 1, ()), (2, 2, ()), thorough(2, 1, ("r2",)), (5, 1, BLIND)],
+    [thorough(1, 1, ()), thorough(2, 2, ()), thorough(2, 1, ("r2",)), (5, 1, BLIND)],
 )
 def test_without_noise_there_is_no_error(robots: int, days: int, blind: tuple[str, ...]) -> None:
     world = make_world(robots=robots, days=days, blind=blind, noise=0.0, seconds=40.0)

@@ -69,17 +69,13 @@ def test_the_run_holds_all_that_can_happen(run: Run) -> None:
 
 
 def test_another_process_with_other_hashes_has_it_again_too(folder: Path) -> None:
-    """A set of texts has another order in each process."""
-    for seed in "1", "2":
-        environment = {
-            **os.environ,
-            "PYTHONHASHSEED": seed,
-            "PYTHONPATH": os.pathsep.join(sys.path),
-        }
-        command = [*PROGRAM, "replay", str(folder)]
-        done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
-        assert done.returncode == 0, done.stderr
-        assert done.stdout.count(": equal to the bit: ") == 5
+    """A set of texts has another order in each process; in this one, which has recorded the run,
+    it is random."""
+    environment = {**os.environ, "PYTHONHASHSEED": "1", "PYTHONPATH": os.pathsep.join(sys.path)}
+    command = [*PROGRAM, "replay", str(folder)]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.count(": equal to the bit: ") == 5
 
 
 def with_changed_steps(folder: Path, process: Process, steps: list[Step]) -> Replay:

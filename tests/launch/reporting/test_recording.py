@@ -86,6 +86,7 @@ def test_recording_does_not_change_a_run(tmp_path: Path) -> None:
     assert {type(item) for item in recorded.inputs["observer"]} == {Sightings}
 
 
+@pytest.mark.thorough
 def test_up_records_its_run(tmp_path: Path) -> None:
     path = tmp_path / "up.mcap"
     ran = cpcbl_team("up", "demo", "--duration", 4, "--speed", 2, "--record", path, "--json")
