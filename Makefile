@@ -42,10 +42,10 @@ check: setup
 	$(BIN)/mypy
 	PYTHONPATH=.:agents:transport:launch $(BIN)/lint-imports --no-cache
 
-# Two workers for each of two cores: many tests wait for the processes that they started. Each worker
-# finds all tests anew. In a new clone each would compile them as well, at the same time.
+# One worker more than cores: many tests wait for the processes that they started. Each worker finds
+# all tests anew. In a new clone each would compile them as well, at the same time.
 unit: $(VENV)/compiled-tests
-	$(BIN)/pytest -n 4 --dist worksteal -m "$(USUAL)"
+	$(BIN)/pytest -n 3 --dist worksteal -m "$(USUAL)"
 
 $(VENV)/compiled-tests: $(VENV)/ready
 	@$(BIN)/pytest --collect-only -q > /dev/null 2>&1 || true  # what is wrong, the next run says

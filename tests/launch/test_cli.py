@@ -205,7 +205,7 @@ def test_up_reports_to_file_and_standard_output(tmp_path: Path) -> None:
     team, written = tmp_path / "team.toml", tmp_path / "report.json"
     team.write_text(PAIR)
     ran = patient_up(
-        *(team, "--duration", 12, "--speed", 4, "--seed", 5, "--json", "--report", written)
+        *(team, "--duration", 20, "--speed", 4, "--seed", 5, "--json", "--report", written)
     )
     assert ran.returncode == 0, ran.stderr
     report = json.loads(ran.stdout)
