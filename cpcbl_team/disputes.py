@@ -1,10 +1,10 @@
 """Who supports the estimate in a dispute about it: a sender contradicts it for a while, and others
 agree with it, or are too vague to tell.
 
-What a source says of both sides is the sum of its reports since the dispute began: of the
-differences of their chi-squares by what the dissenter says and by the estimate. Its mean over some
-seconds would not do, for the estimate may have been led away in less time than that: reports from
-before then agreed with it.
+Each report of a source since the dispute began is compared with both sides: its chi-square by what
+the dissenter says, minus that by the estimate. The sum of these differences tells on which side the
+source is. Its mean over some seconds would not do: the estimate may have been led away in less time
+than that, and reports from before then agreed with it.
 """
 
 from collections.abc import Collection
@@ -20,19 +20,25 @@ from cpcbl_team.mean_offsets import (
     by_whole_noise,
     lead,
 )
-from cpcbl_team.sender_comparisons import OWN_SENSORS, SenderRecords, recent_senders
-from cpcbl_team.sender_records import Denial, OffsetEvidence, SenderRecord
+from cpcbl_team.sender_comparisons import SenderRecords, recent_senders
+from cpcbl_team.sender_records import (
+    OWN_SENSORS,
+    Denial,
+    OffsetEvidence,
+    SenderRecord,
+    TeammateReport,
+)
 
 
 def with_denial(
-    senders: SenderRecords, name: str, evidence: OffsetEvidence | None, now_ns: int
+    record: SenderRecord, senders: SenderRecords, name: str, report: TeammateReport
 ) -> SenderRecord:
-    """The record of a source after one more report, with what that says of the dissenter whose
-    score against the estimate is the largest, if there is one."""
-    record = senders[name]
+    """The record of a source with what its report says of the dissenter whose score against the
+    estimate is the largest, if there is one."""
+    evidence = report.evidence
     scores = [
         (r.score, n)
-        for n, r in recent_senders(senders, now_ns, name)
+        for n, r in recent_senders(senders, report.stamp_ns, name)
         if r.score > 0.0 and n != OWN_SENSORS
     ]
     if not scores:

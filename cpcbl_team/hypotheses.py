@@ -19,8 +19,14 @@ from cpcbl_team.compromises import FRESH_NS, compromise
 from cpcbl_team.fixes import PoseObservation
 from cpcbl_team.fusion import mark_shared
 from cpcbl_team.own_pose import NO_HYPOTHESES, OwnPose
-from cpcbl_team.sender_comparisons import OWN_SENSORS, RECENT_NS, SenderRecords
-from cpcbl_team.sender_records import BY_COMPARISON, NEVER_NS, NO_EVIDENCE, SenderRecord
+from cpcbl_team.sender_comparisons import SenderRecords, reporting_senders
+from cpcbl_team.sender_records import (
+    BY_COMPARISON,
+    NEVER_NS,
+    NO_EVIDENCE,
+    OWN_SENSORS,
+    SenderRecord,
+)
 from cpcbl_team.state import State
 
 FADING_NS: Final = 20_000_000_000  # time constant with which evidence fades
@@ -35,11 +41,7 @@ def contested_names(senders: SenderRecords, now_ns: int) -> list[str]:
     """The senders of which one must be wrong, at present: if any of them contradicts another one or
     own sensors, all that reported lately and whose mean can be wrong. The robots of the team are
     first."""
-    recent = {
-        n: r
-        for n, r in senders.items()
-        if n != OWN_SENSORS and now_ns - r.last_report_ns <= RECENT_NS
-    }
+    recent = {n: r for n, r in reporting_senders(senders, now_ns).items() if n != OWN_SENSORS}
     if not any(_is_contradicted(r) for r in recent.values()):
         return []
     names = [n for n, r in recent.items() if any(m and m.can_be_wrong for m in r.means)]

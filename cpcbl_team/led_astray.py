@@ -27,10 +27,11 @@ from cpcbl_team.miscalibration import noise_with_factor
 from cpcbl_team.own_pose import LONGEST_NS, OwnPose
 from cpcbl_team.parameters import Sensitivity, sensitivity_dot
 from cpcbl_team.recovery_evidence import without_senders
-from cpcbl_team.sender_comparisons import OWN_SENSORS, RECENT_NS, SenderRecords
+from cpcbl_team.sender_comparisons import RECENT_NS, SenderRecords
 from cpcbl_team.sender_records import (
     BY_COMPARISON,
     CONTRADICTING_NIS,
+    OWN_SENSORS,
     SILENCE_NS,
     QuarantineReason,
     quarantined,

@@ -14,7 +14,7 @@ from cpcbl_team.mean_offsets import (
     disagreement,
     lead,
 )
-from cpcbl_team.sender_records import NO_EVIDENCE
+from cpcbl_team.sender_records import NO_EVIDENCE, OWN_SENSORS
 
 SURE_SIGMA_M: Final = 0.08  # own sensors that are less certain convict and doubt nobody alone
 CONFLICT_OF_MOST: Final = 36.0
@@ -79,7 +79,7 @@ def compared_with_own_sensors(
     rivals = [n for n, other in others.items() if contradicts(mean, other)]
     friends = [other for n, other in others.items() if n not in rivals]
     doubters = [other for n, other in others.items() if leads[n] >= -NEARER]
-    of_own = behind.get("", 0.0)
+    of_own = behind.get(OWN_SENSORS, 0.0)
     is_sure = own is not None and own.is_within(SURE_SIGMA_M) and of_own >= -NEARER
     if own is not None and is_sure:
         doubters.append(own)

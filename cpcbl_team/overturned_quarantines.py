@@ -11,13 +11,12 @@ from typing import Final
 
 from cpcbl_team.mean_offsets import CONFLICT, FAST, disagreement
 from cpcbl_team.sender_comparisons import (
-    OWN_SENSORS,
-    RECENT_NS,
     SenderRecords,
     open_rivals,
+    reporting_senders,
     votes,
 )
-from cpcbl_team.sender_records import BY_COMPARISON
+from cpcbl_team.sender_records import BY_COMPARISON, OWN_SENSORS
 
 ALIKE_M: Final = 0.05  # two senders whose offsets differ by no more, or by half of them, agree
 OVERTURNED_NS: Final = 20_000_000_000  # an older quarantine is not overturned
@@ -28,7 +27,7 @@ def outvoted_majority(
 ) -> frozenset[str]:
     """The senders that were quarantined lately, and that agree with those that are now, if they are
     half or more of three or more senders; else none."""
-    recent = _recent(senders, now_ns)
+    recent = reporting_senders(senders, now_ns)
     if OWN_SENSORS in recent or votes(recent, recent, recent) < 3:
         return frozenset()
     new = [recent[n].mean_offset for n in quarantined if n in recent]
@@ -46,7 +45,7 @@ def witnesses_of_contest(senders: SenderRecords, name: str, now_ns: int) -> froz
     of this sender: they agree with one party and contradict the other. The estimate that they
     contradicted followed both parties, so one of these has led it astray."""
     rivals = open_rivals(senders, name)
-    recent = _recent(senders, now_ns) if rivals else {}
+    recent = reporting_senders(senders, now_ns) if rivals else {}
     if not recent or OWN_SENSORS in recent:
         return frozenset()
     parties = [name, *(rival.name for rival in rivals if rival.name in recent)]
@@ -60,10 +59,6 @@ def witnesses_of_contest(senders: SenderRecords, name: str, now_ns: int) -> froz
         if apart and min(apart) <= CONFLICT < max(apart):
             found.add(witness)
     return frozenset(found)
-
-
-def _recent(senders: SenderRecords, now_ns: int) -> SenderRecords:
-    return {n: r for n, r in senders.items() if now_ns - r.last_report_ns <= RECENT_NS}
 
 
 def _lately_quarantined(senders: SenderRecords, now_ns: int) -> Iterator[str]:

@@ -29,13 +29,17 @@ from cpcbl_team.mean_offsets import (
     contradicts,
     disagreement,
 )
-from cpcbl_team.sender_records import NEVER_NS, SILENCE_NS, Rival, SenderRecord
+from cpcbl_team.sender_records import NEVER_NS, OWN_SENSORS, SILENCE_NS, Rival, SenderRecord
 
-OWN_SENSORS = ""  # stands for the robot's own sensors among the senders; no robot has this name
 RECENT_NS: Final = 3_000_000_000  # a sender takes part in disputes for so long after a report
 LEAST_CONFIRMED: Final = 20  # reports of a guest with which others agreed, until it is proven
 DOUBT_NS: Final = 60_000_000_000  # for so long new guests have the doubt about earlier ones
 SenderRecords = Mapping[str, SenderRecord]
+
+
+def reporting_senders(senders: SenderRecords, now_ns: int) -> SenderRecords:
+    """The senders that reported recently, those in quarantine too."""
+    return {n: r for n, r in senders.items() if _is_reporting(r, now_ns)}
 
 
 def recent_senders(
@@ -43,8 +47,12 @@ def recent_senders(
 ) -> Iterator[tuple[str, SenderRecord]]:
     """The senders out of quarantine that reported recently."""
     for name, r in senders.items():
-        if name != without and not r.reason and now_ns - r.last_report_ns <= RECENT_NS:
+        if name != without and not r.reason and _is_reporting(r, now_ns):
             yield name, r
+
+
+def _is_reporting(record: SenderRecord, now_ns: int) -> bool:
+    return now_ns - record.last_report_ns <= RECENT_NS
 
 
 def senders_with_a_say(senders: SenderRecords, name: str, now_ns: int) -> SenderRecords:

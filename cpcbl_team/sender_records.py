@@ -48,6 +48,7 @@ CLEAR_CONFLICTS = 0.5  # so many conflicts speak against a sender if one was jus
 REPEATED_CONFLICTS = 1.5  # and so many at any time: an old one alone may be chance
 JUST_BEFORE_NS: Final = 2_000_000_000
 NEVER_NS: Final = -(2**62)
+OWN_SENSORS = ""  # stands for the robot's own sensors among the senders; no robot has this name
 NO_EVIDENCE: Final[Mapping[str, float]] = MappingProxyType({})
 
 

@@ -41,13 +41,18 @@ from cpcbl_team.measurements import (
 from cpcbl_team.recovery_evidence import without_senders
 from cpcbl_team.sender_comparisons import (
     LEAST_CONFIRMED,
-    OWN_SENSORS,
     RECENT_NS,
     SenderRecords,
     contest_m,
     voters,
 )
-from cpcbl_team.sender_records import NEVER_NS, OffsetEvidence, ReportedPosition, TeammateReport
+from cpcbl_team.sender_records import (
+    NEVER_NS,
+    OWN_SENSORS,
+    OffsetEvidence,
+    ReportedPosition,
+    TeammateReport,
+)
 from cpcbl_team.state import State, with_memory, with_senders, with_teammates
 
 INDEPENDENT_FRAMES = 0.1  # of a camera: the next frame has nearly the same errors of tilt and edges

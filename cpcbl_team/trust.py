@@ -28,7 +28,6 @@ from cpcbl_team.mean_comparisons import EVIDENCE_ON_MOST, Comparison
 from cpcbl_team.mean_offsets import FAST, disagreement
 from cpcbl_team.overturned_quarantines import outvoted_majority, witnesses_of_contest
 from cpcbl_team.sender_comparisons import (
-    OWN_SENSORS,
     RECENT_NS,
     SenderRecords,
     compare,
@@ -37,6 +36,7 @@ from cpcbl_team.sender_comparisons import (
     members,
     open_rivals,
     recent_senders,
+    reporting_senders,
     rival_of,
     senders_with_a_say,
     votes,
@@ -49,6 +49,7 @@ from cpcbl_team.sender_records import (
     CONTRADICTING_NIS,
     JUMP_SIGMAS,
     MOST_NIS,
+    OWN_SENSORS,
     SILENCE_NS,
     OffsetEvidence,
     QuarantineReason,
@@ -142,8 +143,7 @@ def _decide(
     """The decision that the tests of one report lead to."""
     now = report.stamp_ns
     record = with_report(senders.get(name, SenderRecord()), report, rules.limit)
-    senders = {**senders, name: record}
-    record = with_denial(senders, name, report.evidence, now)
+    record = with_denial(record, senders, name, report)
     senders = {**senders, name: record}
     comparison = compare(senders, name, now)
     if comparison is not None:
@@ -282,9 +282,7 @@ def _without_decision(decision: TrustDecision, side: Collection[str], now_ns: in
     on it is released, and the estimate is as uncertain as they differ from it. Means of reports
     that were not used begin anew, for by the old ones both sides seem to agree."""
     before, errors_m = decision.senders, [decision.estimate_error_m]
-    recent = [
-        n for n, r in before.items() if n != OWN_SENSORS and now_ns - r.last_report_ns <= RECENT_NS
-    ]
+    recent = [n for n in reporting_senders(before, now_ns) if n != OWN_SENSORS]
     senders = dict(before)
     for name in recent:
         record = before[name]

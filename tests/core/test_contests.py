@@ -19,8 +19,9 @@ from cpcbl_team.geometry import Pose2
 from cpcbl_team.inflation import inflate_to
 from cpcbl_team.inputs import BeliefShared
 from cpcbl_team.mean_offsets import FadingOffsets, MeanOffset
-from cpcbl_team.sender_comparisons import OWN_SENSORS, contest_m, open_rivals
+from cpcbl_team.sender_comparisons import contest_m, open_rivals
 from cpcbl_team.sender_records import (
+    OWN_SENSORS,
     OffsetEvidence,
     QuarantineReason,
     SenderRecord,

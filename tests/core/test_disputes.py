@@ -5,15 +5,18 @@ import math
 import pytest
 from msgspec.structs import replace
 from support.core import SECOND
+from support.trust import AGREES
 
 from cpcbl_team.disputes import supporters_of_estimate, with_denial
 from cpcbl_team.estimate import Covariance3
 from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.mean_offsets import USUAL, MeanOffset
 from cpcbl_team.sender_records import (
+    Denial,
     OffsetEvidence,
     QuarantineReason,
     SenderRecord,
+    TeammateReport,
     without_comparisons,
 )
 
@@ -26,11 +29,17 @@ DISSENTER = SenderRecord(
 )
 
 
-def report(x: float, sigma_m: float, dependent_m: float = 0.0) -> OffsetEvidence:
+def report(x: float, sigma_m: float, dependent_m: float = 0.0) -> TeammateReport:
     """A report that the estimate is off by so much in x."""
     a, d = 1.0 / sigma_m**2, dependent_m**2
     matrix = Covariance3(a, 0.0, a, 0.0, 0.0, 0.0)
-    return OffsetEvidence((matrix, (a * x, 0.0, 0.0)), Covariance2(d, 0.0, d))
+    evidence = OffsetEvidence((matrix, (a * x, 0.0, 0.0)), Covariance2(d, 0.0, d))
+    return TeammateReport(NOW_NS, AGREES, evidence=evidence)
+
+
+def denial(senders: dict[str, SenderRecord], name: str, said: TeammateReport) -> Denial | None:
+    """What is kept of this report."""
+    return with_denial(senders[name], senders, name, said).denial
 
 
 def source(*offsets: float, sigma_m: float = 0.07, mean_m: float | None = None) -> SenderRecord:
@@ -42,7 +51,7 @@ def source(*offsets: float, sigma_m: float = 0.07, mean_m: float | None = None) 
     record = SenderRecord(NOW_NS, last_agreement_ns=NOW_NS, means=(mean, mean))
     for x in offsets:
         senders = {"dissenter": DISSENTER, "other": record}
-        record = with_denial(senders, "other", report(x, sigma_m), NOW_NS)
+        record = with_denial(record, senders, "other", report(x, sigma_m))
     return record
 
 
@@ -55,11 +64,11 @@ def test_a_denial_is_the_difference_of_chi_squares() -> None:
     """By the whole noise of each report: its own part, and that which is the same in all."""
     sigma_m, dependent_m = 0.03, 0.04  # 0.05 together
     senders = {"dissenter": DISSENTER, "other": SenderRecord(NOW_NS)}
-    record = with_denial(senders, "other", report(0.05, sigma_m, dependent_m), NOW_NS)
+    found = denial(senders, "other", report(0.05, sigma_m, dependent_m))
     expected = (0.15 / 0.05) ** 2 - (0.05 / 0.05) ** 2
-    assert record.denial is not None
-    assert record.denial[:2] == ("dissenter", BEGAN_NS)
-    assert record.denial.chi_square == pytest.approx(expected)
+    assert found is not None
+    assert found[:2] == ("dissenter", BEGAN_NS)
+    assert found.chi_square == pytest.approx(expected)
 
 
 def test_one_that_agreed_before_the_estimate_was_led_away_does_not_support_it() -> None:
@@ -80,24 +89,24 @@ def test_one_that_is_too_vague_to_tell_supports_nobody(sigma_m: float, is_told: 
 def test_each_dispute_begins_anew() -> None:
     told = source(0.0, 0.0)
     assert told.denial is not None
-    evidence = report(0.0, 0.07)
+    said = report(0.0, 0.07)
     later = replace(DISSENTER, dispute_since_ns=NOW_NS)
-    again = with_denial({"dissenter": later, "other": told}, "other", evidence, NOW_NS).denial
+    again = denial({"dissenter": later, "other": told}, "other", said)
     assert again is not None
     assert again.chi_square == pytest.approx(told.denial.chi_square / 2.0)
     louder = {"dissenter": DISSENTER, "x": replace(DISSENTER, score=2.0 * LIMIT), "other": told}
     assert math.isclose(again.chi_square, (CLAIM_M / 0.07) ** 2)
-    found = with_denial(louder, "other", evidence, NOW_NS).denial
+    found = denial(louder, "other", said)
     assert found is not None
     assert found.of == "x"
     none = {"dissenter": replace(DISSENTER, score=0.0), "other": told}
-    assert with_denial(none, "other", evidence, NOW_NS).denial is None
+    assert denial(none, "other", said) is None
     assert without_comparisons(told).denial is None
 
 
 def test_nobody_denies_itself_or_one_in_quarantine() -> None:
-    evidence = report(0.0, 0.02)
+    said = report(0.0, 0.02)
     senders = {"dissenter": DISSENTER, "other": SenderRecord(NOW_NS)}
-    assert with_denial(senders, "dissenter", evidence, NOW_NS).denial is None
+    assert denial(senders, "dissenter", said) is None
     senders["dissenter"] = replace(DISSENTER, reason=QuarantineReason.BIASED)
-    assert with_denial(senders, "other", evidence, NOW_NS).denial is None
+    assert denial(senders, "other", said) is None

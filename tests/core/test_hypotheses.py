@@ -49,8 +49,13 @@ from cpcbl_team.mean_comparisons import EVIDENCE, EVIDENCE_ON_MOST, compared_wit
 from cpcbl_team.mean_offsets import MeanOffset
 from cpcbl_team.miscalibration import AS_CONFIGURED
 from cpcbl_team.own_pose import OwnPose
-from cpcbl_team.sender_comparisons import OWN_SENSORS
-from cpcbl_team.sender_records import QuarantineReason, Rival, SenderRecord, TeammateReport
+from cpcbl_team.sender_records import (
+    OWN_SENSORS,
+    QuarantineReason,
+    Rival,
+    SenderRecord,
+    TeammateReport,
+)
 from cpcbl_team.state import State
 from cpcbl_team.trust import assess
 

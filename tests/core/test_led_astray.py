@@ -27,8 +27,7 @@ from cpcbl_team.miscalibration import AS_CONFIGURED
 from cpcbl_team.motion import turn_variance
 from cpcbl_team.own_pose import OwnPose
 from cpcbl_team.scale_errors import ScaleErrors
-from cpcbl_team.sender_comparisons import OWN_SENSORS
-from cpcbl_team.sender_records import QuarantineReason, SenderRecord
+from cpcbl_team.sender_records import OWN_SENSORS, QuarantineReason, SenderRecord
 from cpcbl_team.state import State
 
 NOW_NS = 100 * SECOND

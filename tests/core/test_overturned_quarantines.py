@@ -10,8 +10,13 @@ from support.trust import AGREES, RULES
 from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.mean_offsets import FadingOffsets, MeanOffset
 from cpcbl_team.overturned_quarantines import OVERTURNED_NS, witnesses_of_contest
-from cpcbl_team.sender_comparisons import OWN_SENSORS
-from cpcbl_team.sender_records import QuarantineReason, Rival, SenderRecord, TeammateReport
+from cpcbl_team.sender_records import (
+    OWN_SENSORS,
+    QuarantineReason,
+    Rival,
+    SenderRecord,
+    TeammateReport,
+)
 from cpcbl_team.trust import assess
 
 NOW_NS = 100 * SECOND

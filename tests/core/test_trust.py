@@ -13,8 +13,9 @@ from support.trust import AGREES, CONTRADICTS, MS, RULES, Receiver
 from cpcbl_team.estimate import Covariance3
 from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.mean_offsets import MeanOffset
-from cpcbl_team.sender_comparisons import OWN_SENSORS, contest_m
+from cpcbl_team.sender_comparisons import contest_m
 from cpcbl_team.sender_records import (
+    OWN_SENSORS,
     USUAL_NIS,
     OffsetEvidence,
     QuarantineReason,
