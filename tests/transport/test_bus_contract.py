@@ -1,6 +1,7 @@
 """One contract for every bus: what holds in memory holds over Zenoh."""
 
 import gc
+import weakref
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from itertools import count
@@ -183,6 +184,22 @@ def test_subscriptions_outlive_their_handles(pair: Pair) -> None:
     gc.collect()
     deliver(pair, "a/b")
     wait_until(lambda: bool(heard))
+
+
+def test_what_is_closed_is_forgotten(pair: Pair) -> None:
+    """A robot subscribes anew at each change of a tier, for as long as it runs."""
+    declared = [
+        pair.one.publisher("a", RELIABLE),
+        pair.one.subscribe("a", lambda key, payload: None),
+        pair.one.declare_token("a"),
+        pair.one.watch_liveliness("a", lambda key, alive: None),
+    ]
+    kept = [weakref.ref(handle) for handle in declared]
+    for handle in declared:
+        handle.close()
+    del handle, declared
+    gc.collect()
+    assert [ref() for ref in kept] == [None] * 4
 
 
 def test_closing_a_session_ends_its_subscriptions(pair: Pair) -> None:

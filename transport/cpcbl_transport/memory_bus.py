@@ -9,7 +9,6 @@ from cpcbl_transport.bus import Bus, Handle, LivelinessCallback, MessageCallback
 from cpcbl_transport.topics import Qos
 
 Thing = TypeVar("Thing")
-HandleT = TypeVar("HandleT", bound=Handle)
 MOST_CHANGES = 32  # that an index remembers
 
 
@@ -18,12 +17,21 @@ class _Subscriber(NamedTuple):
     on_message: MessageCallback
 
 
-class _Handle:
-    def __init__(self, undeclare: Callable[[], object]) -> None:
-        self._undeclare = undeclare
+class _Declared:
+    """Something declared; its session keeps it until it is closed."""
+
+    def __init__(self, session: "MemoryBus", undeclare: Callable[[], object]) -> None:
+        self._session, self._undeclare = session, undeclare
+        session.declared[self] = None
+
+    @property
+    def open(self) -> bool:
+        return self in self._session.declared
 
     def close(self) -> None:
-        self._undeclare()
+        if self.open:
+            del self._session.declared[self]
+            self._undeclare()
 
 
 class MemoryHub:
@@ -42,19 +50,20 @@ class MemoryHub:
             on_change(key, alive)
 
 
-class _MemoryPublisher:
-    def __init__(self, hub: MemoryHub, session: object, key: str) -> None:
-        self._hub, self._session, self._key, self._open = hub, session, key, True
+class _MemoryPublisher(_Declared):
+    def __init__(self, hub: MemoryHub, session: "MemoryBus", key: str) -> None:
+        super().__init__(session, lambda: None)
+        self._hub, self._key = hub, key
         self._patterns = patterns_of(key)
         self._found: list[_Subscriber] = []
         self._changes = 0  # of the subscribers, that are in what was found
 
     @property
     def matching(self) -> bool:
-        return self._open and bool(self._others())
+        return self.open and bool(self._others())
 
     def put(self, payload: bytes) -> None:
-        if self._open:
+        if self.open:
             for subscriber in self._others():
                 subscriber.on_message(self._key, payload)
 
@@ -68,22 +77,19 @@ class _MemoryPublisher:
             self._changes = subscribers.changes
         return self._found
 
-    def close(self) -> None:
-        self._open = False
-
 
 class MemoryBus(Bus):
     """One session on a hub."""
 
     def __init__(self, hub: MemoryHub) -> None:
         self._hub = hub
-        self._declared: list[Handle] = []
+        self.declared: dict[Handle, None] = {}  # in this order
 
     def publisher(self, key: str, qos: Qos) -> Publisher:
-        return self._keep(_MemoryPublisher(self._hub, self, key))
+        return _MemoryPublisher(self._hub, self, key)
 
     def subscribe(self, keys: str, on_message: MessageCallback) -> Handle:
-        return self._keep(_Handle(self._hub.subscribers.add([keys], _Subscriber(self, on_message))))
+        return _Declared(self, self._hub.subscribers.add([keys], _Subscriber(self, on_message)))
 
     def declare_token(self, key: str) -> Handle:
         remove = self._hub.tokens.add(patterns_of(key), key)
@@ -93,21 +99,17 @@ class MemoryBus(Bus):
             if remove():
                 self._hub.notify_watchers(key, False)
 
-        return self._keep(_Handle(close))
+        return _Declared(self, close)
 
     def watch_liveliness(self, keys: str, on_change: LivelinessCallback) -> Handle:
-        watcher = self._keep(_Handle(self._hub.watchers.add([keys], on_change)))
+        watcher = _Declared(self, self._hub.watchers.add([keys], on_change))
         for key in self._hub.tokens.find({keys}):
             on_change(key, True)
         return watcher
 
     def close(self) -> None:
-        while self._declared:
-            self._declared.pop().close()
-
-    def _keep(self, handle: HandleT) -> HandleT:
-        self._declared.append(handle)
-        return handle
+        for handle in reversed(list(self.declared)):
+            handle.close()
 
 
 # Keys with wildcards ------------------------------------------------------------------------------
