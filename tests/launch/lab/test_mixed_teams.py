@@ -1,9 +1,17 @@
 """Simulated teams of mixed quality, with which budgets are measured."""
 
+import math
+from random import Random
+
 import pytest
 
 from cpcbl_launch.lab.experiments import budget
-from cpcbl_launch.lab.experiments.budget import RunFigures, interval_rmse_m
+from cpcbl_launch.lab.experiments.budget import (
+    RunFigures,
+    interval_rmse_m,
+    share_of_interval,
+    standard_error,
+)
 from cpcbl_launch.lab.experiments.mixed_teams import WORLDS, known_world, mixed_team
 from cpcbl_team.errors import InputError
 
@@ -59,6 +67,27 @@ def test_a_budget_is_compared_with_an_interval_of_the_same_bytes() -> None:
     assert interval_rmse_m(intervals, 6.0) == pytest.approx(0.2)
     assert interval_rmse_m(intervals, 20.0) == pytest.approx(0.2)
     assert interval_rmse_m(intervals, 0.5) is None
+
+
+def test_a_share_is_one_of_means_and_its_error_that_of_independent_runs() -> None:
+    """A budget that sends and errs as an interval does, but in other runs, is as good as that."""
+    random = Random(1)
+    errors_m = [(random.uniform(0.9, 1.1), random.uniform(0.9, 1.1)) for _ in range(400)]
+    by_run = [(RunFigures(1.0, a), RunFigures(1.0, b)) for a, b in errors_m]
+    share, error = share_of_interval(by_run), standard_error(by_run)
+    assert share is not None
+    assert error is not None
+    assert error == pytest.approx(0.1 / math.sqrt(3.0 * 400.0) * math.sqrt(2.0), rel=0.1)
+    assert abs(share - 1.0) < 3.0 * error
+    assert standard_error(by_run[:2]) is None
+
+
+def test_the_luck_of_single_runs_does_not_count_for_intervals() -> None:
+    by_run = [
+        (RunFigures(2.0, 0.5), RunFigures(1.0, low), RunFigures(2.0, 1.0 - low))
+        for low in (0.2, 0.8, 0.2, 0.8)
+    ]
+    assert share_of_interval(by_run) == pytest.approx(1.0)
 
 
 @pytest.mark.long

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from itertools import groupby, pairwise
 from pathlib import Path
-from statistics import fmean, stdev
+from statistics import fmean, pvariance
 from typing import Any, NamedTuple
 
 from msgspec import Struct
@@ -62,8 +62,8 @@ class RunFigures(Struct, frozen=True):
 
 
 class Comparison(Struct, frozen=True, kw_only=True):
-    """The error under a budget as a share of that with a fixed interval of the same bytes: mean
-    over the runs, and its standard error if there are several."""
+    """The error under a budget as a share of that with a fixed interval of the same bytes: of the
+    means over the runs, with its standard error if there are several."""
 
     setting: str
     bytes_per_s: float
@@ -213,29 +213,44 @@ def interval_rmse_m(intervals: Sequence[RunFigures], bytes_per_s: float) -> floa
 
 
 def comparisons(points: Sequence[Point]) -> tuple[Comparison, ...]:
-    """Each budget beside a fixed interval of the bytes that it sent, run by run."""
+    """Each budget beside a fixed interval of the bytes that it sent."""
     intervals = [p.runs for p in points if p.series == INTERVALS]
     compared = []
     for p in points:
-        if p.series not in BUDGETS:
-            continue
-        shares = [
-            run.position_rmse_m / rmse_m
-            for number, run in enumerate(p.runs)
-            if (rmse_m := interval_rmse_m([i[number] for i in intervals], run.bytes_per_s))
-        ]
-        if shares:
-            error = stdev(shares) / math.sqrt(len(shares)) if len(shares) > 1 else None
+        by_run = list(zip(p.runs, *intervals, strict=True))
+        if p.series in BUDGETS and (share := share_of_interval(by_run)) is not None:
             compared.append(
                 Comparison(
                     setting=p.setting,
                     bytes_per_s=p.bytes_per_s,
                     position_rmse_m=p.position_rmse_m,
-                    share=fmean(shares),
-                    standard_error=error,
+                    share=share,
+                    standard_error=standard_error(by_run),
                 )
             )
     return tuple(compared)
+
+
+def share_of_interval(by_run: Sequence[Sequence[RunFigures]]) -> float | None:
+    """The error under a budget as a share of that with a fixed interval of the same bytes. Each run
+    has the figures with the budget and then those with each interval. Their means over the runs are
+    compared: in a single run the best interval is the one that had luck there."""
+    budget, *intervals = (
+        RunFigures(fmean(r.bytes_per_s for r in runs), fmean(r.position_rmse_m for r in runs))
+        for runs in zip(*by_run, strict=True)
+    )
+    rmse_m = interval_rmse_m(intervals, budget.bytes_per_s)
+    return budget.position_rmse_m / rmse_m if rmse_m else None
+
+
+def standard_error(by_run: Sequence[Sequence[RunFigures]]) -> float | None:
+    """The standard error of that share, by the jackknife (Efron & Tibshirani, An Introduction to
+    the Bootstrap, 1993, equation 11.5); None with less than three runs."""
+    if len(by_run) < 3:
+        return None
+    without_each = ([*by_run[:i], *by_run[i + 1 :]] for i in range(len(by_run)))
+    shares = [s for runs in without_each if (s := share_of_interval(runs)) is not None]
+    return math.sqrt((len(shares) - 1) * pvariance(shares)) if len(shares) > 1 else None
 
 
 def _blind(team: Team) -> tuple[str, ...]:
