@@ -129,14 +129,15 @@ def _sighted_gaussian(
         of_reading = earlier is None and sighting.range_sigma_m is None
         share = sensor.range_share if of_reading else 0.0
         mean_m = unbiased_range_m(range_m, range_sigma, bearing_sigma, share)
-        turned, toward = arc_width(bearing_sigma), bearing
+        turned, toward, distance = arc_width(bearing_sigma), bearing, range_m
     else:
+        distance = expected_m or range_m
         mean_m = range_m * math.exp(min(0.5 * bearing_sigma**2, MOST_SHIFT))
         # Of an error across, the share by which the direction is wrong is along it
         turned = min(bearing_sigma * max(bearing_sigma, abs(off)), 1.0)
         toward = bearing - off
-    along_m = math.hypot(range_sigma, range_m * turned)
-    _, _, covariance = sighting_gaussian(range_m, toward, along_m, bearing_sigma)
+    along_m = math.hypot(range_sigma, distance * turned)
+    _, _, covariance = sighting_gaussian(distance, toward, along_m, bearing_sigma)
     return Gaussian2(mean_m * math.cos(bearing), mean_m * math.sin(bearing), covariance), toward
 
 

@@ -147,7 +147,11 @@ def merge_split(prior: Estimate, observation: Observation, scope: Scope = POSE) 
         _determinant(prior, observation) if scope is POSE else _variance(prior, observation, scope)
     )
     weight, extent = best_weight(goal)
-    if extent >= _size(prior.covariance, scope):
+    before = _size(prior.covariance, scope)
+    if extent >= before:
+        kept, extent = best_weight(lambda k: goal(1.0 - 10.0 ** (-5.0 * k)))
+        weight = 1.0 - 10.0 ** (-5.0 * kept)
+    if extent >= before:
         return prior
     merged = _merge_with_weight(prior, observation, scope, weight)
     is_wider = scope is POSE and merged.covariance.hh > prior.covariance.hh > WIDE_RAD**2
