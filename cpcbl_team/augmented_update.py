@@ -190,10 +190,11 @@ def updated_by_teammate(
     size: Callable[[Covariance3], float] = (
         (lambda c: c.hh) if heading_only else Covariance3.determinant
     )
-    weight, extent = best_weight(lambda w: size(attempt(w).covariance))
+    before = size(prior.covariance)
+    weight, extent = best_weight(lambda w: size(attempt(w).covariance), before)
     update = attempt(weight)
     is_too_wide = update.covariance.hh > MOST_HEADING_VARIANCE
-    if extent >= size(prior.covariance) or is_too_wide or not update.is_sound:
+    if extent >= before or is_too_wide or not update.is_sound:
         return prior, common
     estimate, common = update.result(prior)
     return estimate._replace(shared=estimate.covariance), common

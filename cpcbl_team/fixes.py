@@ -25,6 +25,7 @@ EARLIER_NS = 1_000_000_000  # after which a teammate may be far from where it wa
 MOST_SHIFT = 0.25  # of a range; a Gaussian does not describe what is less certain
 MEAN_S = 0.3  # over which the place of a teammate is a mean
 MOST_OFF = 4.0  # sigmas of a bearing from the direction of that place
+TURNED_OFF = 2.0  # sigmas from there that are more than the error of a reading: the teammate moves
 _NOTHING = Covariance2(0.0, 0.0, 0.0)
 _AXES = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
 _HEADING = ((0.0, 0.0, 1.0),)
@@ -68,8 +69,8 @@ def fix_for(
     which J does not contain, so the arc's variance along the line of sight is added to the
     observer's part. A heading of the teammate is the observer's plus the one in its frame, and so
     are their variances. The covariances are computed at the mean place of `earlier` fixes, whose
-    errors are independent. Computed at the readings themselves, they would bias repeated fixes
-    (Bordonaro, Willett, Bar-Shalom, Decorrelated unbiased converted measurement Kalman filter, IEEE
+    errors are independent. Computed at the readings themselves, they would bias repeated fixes, and
+    those that are chosen for what they gain: short ranges would look precise (Bordonaro, Willett, Bar-Shalom, Decorrelated unbiased converted measurement Kalman filter, IEEE
     Trans. AES, 2014). A first fix has only its own reading: see `unbiased_range_m`. The constant
     errors of the observer's camera (`common`) are part of the observer's error.
     """
@@ -134,8 +135,8 @@ def _sighted_gaussian(
         distance = expected_m or range_m
         mean_m = range_m * math.exp(min(0.5 * bearing_sigma**2, MOST_SHIFT))
         # Of an error across, the share by which the direction is wrong is along it
-        turned = min(bearing_sigma * max(bearing_sigma, abs(off)), 1.0)
-        toward = bearing - off
+        wrong = abs(off) if abs(off) > TURNED_OFF * bearing_sigma else bearing_sigma
+        turned, toward = min(bearing_sigma * wrong, 1.0), bearing - off
     along_m = math.hypot(range_sigma, distance * turned)
     _, _, covariance = sighting_gaussian(distance, toward, along_m, bearing_sigma)
     return Gaussian2(mean_m * math.cos(bearing), mean_m * math.sin(bearing), covariance), toward

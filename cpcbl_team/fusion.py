@@ -130,6 +130,7 @@ def merge_naive(prior: Estimate, observation: Observation, scope: Scope = POSE) 
 
 
 _GOLDEN = 0.6180339887498949
+DECADES = -math.log10(0.02), 5.0  # 1 - w of weights near one, as powers of ten
 WIDE_RAD = math.radians(10.0)  # sigma of a heading
 LEAST_TIED = 0.02  # share of its variance that the position explains
 
@@ -146,11 +147,8 @@ def merge_split(prior: Estimate, observation: Observation, scope: Scope = POSE) 
     goal = (
         _determinant(prior, observation) if scope is POSE else _variance(prior, observation, scope)
     )
-    weight, extent = best_weight(goal)
     before = _size(prior.covariance, scope)
-    if extent >= before:
-        kept, extent = best_weight(lambda k: goal(1.0 - 10.0 ** (-5.0 * k)))
-        weight = 1.0 - 10.0 ** (-5.0 * kept)
+    weight, extent = best_weight(goal, before)
     if extent >= before:
         return prior
     merged = _merge_with_weight(prior, observation, scope, weight)
@@ -170,10 +168,23 @@ def _tells_of_heading(covariance: Covariance3, observation: Observation) -> bool
     return is_tied or any(a for _, _, a in observation.rows)
 
 
-def best_weight(objective: Callable[[float], float]) -> tuple[float, float]:
+def best_weight(
+    objective: Callable[[float], float], before: float = math.inf
+) -> tuple[float, float]:
     """The weight of covariance intersection with the smallest value of `objective`, and that value.
-    Six steps of golden section; the weight is between 0.02 and 0.98."""
-    low, high = 0.02, 0.98
+    The weight is between 0.02 and 0.98, or between 0.98 and 0.99999 if none of those has a value
+    below `before`: what is little beside the estimate still counts. If it did not, the random part
+    of its covariance would select, and the mean of what is selected would not be that of all."""
+    found = _least(objective, 0.02, 0.98)
+    if found[1] < before:
+        return found
+    decades, value = _least(lambda n: objective(1.0 - 10.0**-n), *DECADES)
+    return 1.0 - 10.0**-decades, value
+
+
+def _least(objective: Callable[[float], float], low: float, high: float) -> tuple[float, float]:
+    """Where between two numbers a function is least, and its value there, by six steps of golden
+    section."""
     left, right = high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)
     best_left, best_right = objective(left), objective(right)
     for _ in range(6):
