@@ -69,9 +69,10 @@ def fix_for(
     which J does not contain, so the arc's variance along the line of sight is added to the
     observer's part. A heading of the teammate is the observer's plus the one in its frame, and so
     are their variances. The covariances are computed at the mean place of `earlier` fixes, whose
-    errors are independent. Computed at the readings themselves, they would bias repeated fixes, and
-    those that are chosen for what they gain: short ranges would look precise (Bordonaro, Willett, Bar-Shalom, Decorrelated unbiased converted measurement Kalman filter, IEEE
-    Trans. AES, 2014). A first fix has only its own reading: see `unbiased_range_m`. The constant
+    errors are independent. Computed at the readings themselves, they would bias repeated fixes
+    (Bordonaro, Willett, Bar-Shalom, Decorrelated unbiased converted measurement Kalman filter, IEEE
+    Trans. AES, 2014), and also those that are sent for what they gain, because short ranges would
+    look precise. A first fix has only its own reading: see `unbiased_range_m`. The constant
     errors of the observer's camera (`common`) are part of the observer's error.
     """
     range_m, bearing = sighting.range_m, sighting.bearing_rad
