@@ -36,7 +36,7 @@ of equal distance, with the variance that the components lack. They are two of t
 apart, so their sum is normal within 1 %."""
 SAME: Final = 1.0  # the squared Mahalanobis distance below which two components become one
 MOST_KEPT: Final = 150  # components after a frame
-COARSER: Final = 2.0
+COARSER: Final = 1.5  # step by step, until no more are left
 LEAST_WEIGHT: Final = 1e-5  # of a component, as a share of the sum
 
 
