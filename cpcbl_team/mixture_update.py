@@ -19,8 +19,10 @@ than this share of its variance."""
 LINEAR_SHARE_BESIDE_ARC: Final = 1.0
 """The same where the arc about a single landmark is taken away: linear forms of readings on it
 follow the arc, and give nothing of it away (see `relinearization.py`)."""
-MOST_COMPONENTS: Final = 300  # in a frame,
-MOST_MEASURED: Final = 3000  # and so many objects from them: the time that a frame may take
+MOST_WORK: Final = 4600
+OWN_WORK: Final = 6
+"""A component takes as long as so many objects, without those that update it: so a frame of one
+object makes 657 components at most, one of 30 objects 127."""
 SPLIT_WEIGHT: Final = 1e-4  # of the sum: lighter components are not split,
 ACCEPTED_WEIGHT: Final = 1e-3  # and lighter ones than this accept nothing
 BEND: Final = 0.75
@@ -118,7 +120,7 @@ class MixtureUpdate:
         """The components, in parts so narrow that readings are linear in each one that counts, the
         heaviest first, as long as there are not too many."""
         updated = [self._updated(c, measured) for c in components]
-        most = min(MOST_COMPONENTS, MOST_MEASURED // len(measured))
+        most = MOST_WORK // (OWN_WORK + len(measured))
         while (room := (most - len(updated)) // (len(PARTS) - 1)) > 0:
             weights = _weights(updated)
             least = SPLIT_WEIGHT * sum(weights)

@@ -35,8 +35,8 @@ PARTS: Final = tuple(
 of equal distance, with the variance that the components lack. They are two of their own sigmas
 apart, so their sum is normal within 1 %."""
 SAME: Final = 1.0  # the squared Mahalanobis distance below which two components become one
-MOST_KEPT: Final = 150  # components after a frame
-COARSER: Final = 1.5  # step by step, until no more are left
+MOST_KEPT: Final = 200  # components after a frame
+COARSER: Final = 2.0  # step by step, until no more are left
 LEAST_WEIGHT: Final = 1e-5  # of a component, as a share of the sum
 
 
@@ -170,22 +170,21 @@ def merged(components: Iterable[Component]) -> tuple[Component, ...]:
 
 def _with_same_as_one(heaviest_first: Sequence[Component], same: float) -> list[Component]:
     """Each of the heaviest with all whose squared Mahalanobis distance is less, as one."""
-    left, found = [(c, c.covariance.inverse()) for c in heaviest_first], []
+    left = [(*c.pose, c, c.covariance.inverse()) for c in heaviest_first]
+    found: list[Component] = []
     while left:
-        first, inverse = left[0]
-        (x, y, heading), (xx, _, yy, _, _, _) = first.pose, first.covariance
-        reach = same * (xx + yy)  # what is farther is not the same
+        x, y, heading, first, inverse = left[0]
+        reach = same * (first.covariance.xx + first.covariance.yy)  # farther ones are not the same
         alike: list[Component] = []
-        others: list[tuple[Component, Covariance3]] = []
-        for pair in left:
-            other = pair[0].pose
-            dx, dy = other[0] - x, other[1] - y
+        others: list[tuple[float, float, float, Component, Covariance3]] = []
+        for one in left:
+            dx, dy = one[0] - x, one[1] - y
             if dx * dx + dy * dy < reach:
-                off = dx, dy, wrap_angle(other[2] - heading)
-                if dot(off, inverse.times(off)) < same and dot(off, pair[1].times(off)) < same:
-                    alike.append(pair[0])
+                off = dx, dy, wrap_angle(one[2] - heading)
+                if dot(off, inverse.times(off)) < same and dot(off, one[4].times(off)) < same:
+                    alike.append(one[3])
                     continue
-            others.append(pair)
+            others.append(one)
         found.append(Component(sum(c.weight for c in alike), *moments(alike)))
         left = others
     return found

@@ -28,7 +28,7 @@ from cpcbl_team.estimate import Estimate
 from cpcbl_team.geometry import Pose2, step
 from cpcbl_team.inputs import Odometry, Sighting, Sightings
 from cpcbl_team.localizer import Localizer
-from cpcbl_team.mixture_update import MOST_COMPONENTS
+from cpcbl_team.mixture_update import MOST_WORK, OWN_WORK
 from cpcbl_team.motion import motion_noise, move
 from cpcbl_team.pose_mixtures import (
     MOST_KEPT,
@@ -154,11 +154,11 @@ def test_what_is_nearly_the_same_becomes_one_with_the_same_moments(seed: int) ->
 
 
 def test_few_components_are_kept_and_have_the_moments_of_all() -> None:
-    """Of 400 that are far apart."""
+    """Of 600 that are far apart."""
     rng, narrow = np.random.default_rng(0), diagonal(0.05, 0.05)
     before = [
         Component(float(rng.uniform(0.1, 1.0)), Pose2(x, y, 0.0), narrow)
-        for x, y in rng.uniform(0.0, 6.0, size=(400, 2)).tolist()
+        for x, y in rng.uniform(0.0, 8.0, size=(600, 2)).tolist()
     ]
     after = merged(before)
     assert 0.3 * MOST_KEPT < len(after) <= MOST_KEPT
@@ -189,7 +189,7 @@ def test_a_frame_makes_few_components(
     }
     rows = [row for s in seeds for row in run(landmarks, 1.0, 45.0, 0.0, s)]
     assert max(made) > 50
-    assert max(made) <= MOST_COMPONENTS
+    assert max(made) <= MOST_WORK / (OWN_WORK + objects)
     kept = [len(s.mixture.components) for s, _ in rows if s.mixture is not None]
     assert max(kept, default=0) <= MOST_KEPT
     nees = scored(rows).nees
