@@ -12,7 +12,7 @@ Schmidt 1966) and gives the correlated sideways drift (docs/paper.md, resolution
 import math
 from collections.abc import Iterable
 from enum import Enum
-from math import sqrt
+from math import log, sqrt
 from typing import Final, NamedTuple
 
 from cpcbl_team.gaussian import Covariance2
@@ -171,19 +171,22 @@ class FilteredOffset(NamedTuple):
     covariance: Covariance3
     offset: Row = (0.0, 0.0, 0.0)
     cost: float = 0.0  # the chi-square of the innovations
+    log_determinant: float = 0.0  # of their covariance
 
     def after(self, measurements: Iterable[tuple[Row, float, float]]) -> "FilteredOffset":
         """After more measurements: row, residual and variance of each."""
-        covariance, (x, y, heading), cost = self
+        covariance, (x, y, heading), cost, log_determinant = self
         for row, residual, variance in measurements:
             px, py, ph = covariance.times(row)
-            k = 1.0 / (row[0] * px + row[1] * py + row[2] * ph + variance)
+            of_innovation = row[0] * px + row[1] * py + row[2] * ph + variance
+            log_determinant += log(of_innovation)
+            k = 1.0 / of_innovation
             off = residual - row[0] * x - row[1] * y - row[2] * heading
             cost += k * off * off
             x, y, heading = x + k * off * px, y + k * off * py, heading + k * off * ph
             gained = px * px, px * py, py * py, px * ph, py * ph, ph * ph
             covariance = covariance.plus(new(Covariance3, gained), -k)
-        return FilteredOffset(covariance, (x, y, heading), cost)
+        return FilteredOffset(covariance, (x, y, heading), cost, log_determinant)
 
 
 class InformationSum:

@@ -7,10 +7,10 @@ from typing import Final, NamedTuple
 from cpcbl_team.arcs import Arc
 from cpcbl_team.config import LocalizerSettings
 from cpcbl_team.constraints import Constraint
-from cpcbl_team.estimate import POSE, Estimate, FilteredOffset, Row, dot, sharpest
+from cpcbl_team.estimate import POSE, Estimate, FilteredOffset, Row, sharpest
 from cpcbl_team.geometry import Pose2, wrap_angle
 from cpcbl_team.measurements import Measurement, constraints_of, left_out
-from cpcbl_team.pose_mixtures import Component, PoseMixture, estimate_of, merged
+from cpcbl_team.pose_mixtures import PARTS, Component, PoseMixture, estimate_of, merged
 from cpcbl_team.state import State
 
 LINEAR_SHARE: Final = 0.05
@@ -19,42 +19,58 @@ than this share of its variance."""
 LINEAR_SHARE_BESIDE_ARC: Final = 1.0
 """The same where the arc about a single landmark is taken away: linear forms of readings on it
 follow the arc, and give nothing of it away (see `relinearization.py`)."""
-MOST_COMPONENTS: Final = 1000
+MOST_WORK: Final = 4600
+OWN_WORK: Final = 6
+"""A component takes as long as so many objects, without those that update it: so a frame of one
+object makes 657 components at most, one of 30 objects 127."""
 SPLIT_WEIGHT: Final = 1e-4  # of the sum: lighter components are not split,
 ACCEPTED_WEIGHT: Final = 1e-3  # and lighter ones than this accept nothing
-ALONG_ARC: Final = (0.0, 0.0)  # no direction of the field
 BEND: Final = 0.75
 """An error e of the heading, of variance s, brings a point at the distance d nearer by d e^2 / 2.
 The mean square of that is 3/4 (d s)^2, and d s is the covariance of the position with the heading
 where that heading has led the robot here."""
 
 
+_Reading = tuple[Row, float, float]  # its variance is the last one
+
+
 class _Nonlinearity(NamedTuple):
-    """What linear forms leave out: the largest mean square as a share of a reading's variance, and
-    the direction in which a component is to be split for that. (The larger of two is the one that
-    bends, or that has the larger share.)"""
+    """What the linear form of a reading leaves out. (The larger of two is the one that bends, or
+    that has the larger share.)"""
 
     bends: bool = False
-    share: float = 0.0
-    direction: tuple[float, float] = ALONG_ARC
+    share: float = 0.0  # its mean square as a share of the reading's variance
+    is_bearing: bool = False
+    dx: float = 0.0  # where the object is, from the component (m)
+    dy: float = 0.0
 
 
 class _Updated(NamedTuple):
     """A component with what it would be after a frame, and the log of its weight then."""
 
     before: Component
-    pose: Pose2
-    offset: FilteredOffset
+    after: FilteredOffset
     log_weight: float
     nonlinearity: _Nonlinearity
-    accepted: frozenset[str]
 
     def parts(self) -> list[Component]:
-        """The component in parts in which readings are more linear."""
-        direction = self.nonlinearity.direction
-        if direction == ALONG_ARC:
+        """The component in parts in which the least linear reading is more linear. The bend of an
+        arc goes first, because nothing but a split along the arc follows that."""
+        bends, _, is_bearing, dx, dy = self.nonlinearity
+        if bends:
             return self.before.split_along_arc()
-        return self.before.split(*direction)
+        xx, xy, yy, _, _, _ = self.before.covariance
+        distance = math.hypot(dx, dy)
+        u, v = dx / distance, dy / distance
+        along = xx * u * u + 2.0 * xy * u * v + yy * v * v
+        is_along = is_bearing and along > xx + yy - along
+        return self.before.split(*((u, v) if is_along else (-v, u)))
+
+    def component(self, weight: float) -> Component:
+        """What it is after the frame."""
+        pose, (x, y, turn) = self.before.pose, self.after.offset
+        there = Pose2(pose.x + x, pose.y + y, wrap_angle(pose.heading + turn))
+        return Component(weight, there, self.after.covariance)
 
 
 class MixtureUpdate:
@@ -88,13 +104,11 @@ class MixtureUpdate:
             weights = _weights(updated)
             least = ACCEPTED_WEIGHT * sum(weights)
             heavy = [u for u, weight in zip(updated, weights, strict=True) if weight > least]
-            accepted = frozenset().union(*(u.accepted for u in heavy))
+            accepted = frozenset(
+                m.source for m in used if any(self._accepts(u.before, m) for u in heavy)
+            )
             if len(accepted) == len(used):
-                after = [
-                    Component(weight, u.pose, u.offset.covariance)
-                    for u, weight in zip(updated, weights, strict=True)
-                ]
-                found = merged(after)
+                found = merged(u.component(w) for u, w in zip(updated, weights, strict=True))
                 known = estimate_of(found, estimate)
                 return PoseMixture(found, known, state.stamp_ns), accepted
             used = [m for m in used if m.source in accepted]
@@ -103,48 +117,58 @@ class MixtureUpdate:
     def _split(
         self, components: Sequence[Component], measured: Sequence[Measurement]
     ) -> list[_Updated]:
-        """The components, in parts so narrow that readings are linear in each one that counts."""
+        """The components, in parts so narrow that readings are linear in each one that counts, the
+        heaviest first, as long as there are not too many."""
         updated = [self._updated(c, measured) for c in components]
-        while len(updated) < MOST_COMPONENTS:
+        most = MOST_WORK // (OWN_WORK + len(measured))
+        while (room := (most - len(updated)) // (len(PARTS) - 1)) > 0:
             weights = _weights(updated)
-            least, after = SPLIT_WEIGHT * sum(weights), []
-            for u, weight in zip(updated, weights, strict=True):
-                if weight > least and u.nonlinearity.share > LINEAR_SHARE:
-                    after += [self._updated(part, measured) for part in u.parts()]
-                else:
-                    after.append(u)
-            is_split = len(after) > len(updated)
-            updated = after
-            if not is_split:
+            least = SPLIT_WEIGHT * sum(weights)
+            heaviest_first = sorted(range(len(updated)), key=lambda k: -weights[k])
+            wide = [
+                k
+                for k in heaviest_first
+                if weights[k] > least and updated[k].nonlinearity.share > LINEAR_SHARE
+            ]
+            if not wide:
                 break
+            split = set(wide[:room])
+            parts = [self._updated(part, measured) for k in split for part in updated[k].parts()]
+            updated = [u for k, u in enumerate(updated) if k not in split] + parts
         return updated
 
     def _updated(self, component: Component, measured: Sequence[Measurement]) -> _Updated:
-        """A component after a frame. What linear forms leave out counts as noise."""
-        weight, pose, covariance = component
-        prior, worst, accepted = Estimate(pose, covariance), _Nonlinearity(), []
-        begin = after = FilteredOffset(covariance)
-        log_determinant = 0.0
+        """A component after a frame."""
+        prior, worst = Estimate(component.pose, component.covariance), _Nonlinearity()
+        readings: list[_Reading] = []
         for m in measured:
-            constraints = constraints_of(pose, m, POSE, self._rules)
-            if not constraints:  # it touches the object
-                continue
-            squares = left_out(prior, m, constraints)
-            readings: list[tuple[Row, float, float]] = []
-            for c, square in zip(constraints, squares, strict=True):
-                variance = sharpest(c.sigma * c.sigma)
-                worst = max(worst, _nonlinearity(prior, m, c, square / variance))
-                readings.append((c.row, c.residual, variance + square))
-            if begin.after(readings).cost <= self._gates[len(readings) - 1]:
-                accepted.append(m.source)
-            for reading in readings:
-                row, _, variance = reading
-                log_determinant += math.log(dot(row, after.covariance.times(row)) + variance)
-                after = after.after((reading,))
-        x, y, turn = after.offset
-        there = Pose2(pose.x + x, pose.y + y, wrap_angle(pose.heading + turn))
-        log_weight = math.log(weight) - 0.5 * (log_determinant + after.cost)
-        return _Updated(component, there, after, log_weight, worst, frozenset(accepted))
+            for c, reading, square in self._readings(prior, m):
+                worst = max(worst, _nonlinearity(prior, m, c, square))
+                readings.append(reading)
+        after = FilteredOffset(component.covariance).after(readings)
+        log_weight = math.log(component.weight) - 0.5 * (after.log_determinant + after.cost)
+        return _Updated(component, after, log_weight, worst)
+
+    def _accepts(self, component: Component, m: Measurement) -> bool:
+        """Whether an object agrees with a component (none does that the component touches)."""
+        readings = [r for _, r, _ in self._readings(Estimate(*component[1:]), m)]
+        if not readings:
+            return False
+        cost = FilteredOffset(component.covariance).after(readings).cost
+        return cost <= self._gates[len(readings) - 1]
+
+    def _readings(
+        self, prior: Estimate, m: Measurement
+    ) -> list[tuple[Constraint, _Reading, float]]:
+        """The constraints of an object as readings, and the mean square of what each leaves out,
+        which counts as noise. None where the pose touches the object."""
+        found = []
+        constraints = constraints_of(prior.pose, m, POSE, self._rules)
+        if constraints:
+            for c, square in zip(constraints, left_out(prior, m, constraints), strict=True):
+                variance = sharpest(c.sigma * c.sigma) + square
+                found.append((c, (c.row, c.residual, variance), square))
+        return found
 
 
 def _weights(updated: Sequence[_Updated]) -> list[float]:
@@ -154,20 +178,15 @@ def _weights(updated: Sequence[_Updated]) -> list[float]:
 
 
 def _nonlinearity(
-    prior: Estimate, m: Measurement, constraint: Constraint, share: float
+    prior: Estimate, m: Measurement, constraint: Constraint, square: float
 ) -> _Nonlinearity:
-    """Of one reading: `share` is what the position makes of it. The bend of an arc goes first,
-    because nothing but a split along the arc follows that."""
-    xx, xy, yy, xh, yh, _ = prior.covariance
+    """Of one reading, by the mean `square` that its linear form leaves out of the position, and by
+    the bend of the arc that the prior is on."""
+    _, _, _, xh, yh, _ = prior.covariance
     dx, dy = m.position.x - prior.pose.x, m.position.y - prior.pose.y
-    squared = dx * dx + dy * dy
     variance = sharpest(constraint.sigma * constraint.sigma)
-    in_metres = variance * squared if constraint.is_bearing else variance
+    in_metres = variance * (dx * dx + dy * dy) if constraint.is_bearing else variance
     of_bend = BEND * (xh * xh + yh * yh) / in_metres
     if of_bend > LINEAR_SHARE:
-        return _Nonlinearity(True, of_bend, ALONG_ARC)
-    distance = math.sqrt(squared)
-    u, v = dx / distance, dy / distance
-    along = xx * u * u + 2.0 * xy * u * v + yy * v * v
-    is_along = constraint.is_bearing and along > xx + yy - along
-    return _Nonlinearity(False, share, (u, v) if is_along else (-v, u))
+        return _Nonlinearity(True, of_bend, constraint.is_bearing, dx, dy)
+    return _Nonlinearity(False, square / variance, constraint.is_bearing, dx, dy)

@@ -25,17 +25,18 @@ from cpcbl_team.estimate import (
 from cpcbl_team.geometry import Pose2, wrap_angle
 
 AT_REST: Final = Estimate(Pose2(0.0, 0.0, 0.0), ZERO3)
-NARROWER: Final = 0.5  # the variance of each component of a normal distribution that is split
-BESIDE: Final = math.sqrt(3.0 * (1.0 - NARROWER))  # where the outer ones are, in sigmas
-OUTER_WEIGHT: Final = 1.0 / 6.0
-"""With these weights the sum has the moments of the normal distribution up to the fifth: the nodes
-are those of the Gauss-Hermite quadrature."""
-PARTS: Final = (
-    (OUTER_WEIGHT, -BESIDE),
-    (1.0 - 2.0 * OUTER_WEIGHT, 0.0),
-    (OUTER_WEIGHT, BESIDE),
+NARROWER: Final = 0.25  # the variance of each component of a normal distribution that is split
+_SHARES: Final = tuple(math.exp(-0.5 * k * k / (1.0 - NARROWER)) for k in range(-2, 3))
+_SPREAD: Final = sum(k * k * w for k, w in enumerate(_SHARES, -2)) / sum(_SHARES)
+PARTS: Final = tuple(
+    (w / sum(_SHARES), k * math.sqrt((1.0 - NARROWER) / _SPREAD)) for k, w in enumerate(_SHARES, -2)
 )
+"""The weights of these components and where they are, in sigmas: a normal distribution at points
+of equal distance, with the variance that the components lack. They are two of their own sigmas
+apart, so their sum is normal within 1 %."""
 SAME: Final = 1.0  # the squared Mahalanobis distance below which two components become one
+MOST_KEPT: Final = 200  # components after a frame
+COARSER: Final = 2.0  # step by step, until no more are left
 LEAST_WEIGHT: Final = 1e-5  # of a component, as a share of the sum
 
 
@@ -47,7 +48,7 @@ class Component(NamedTuple):
     covariance: Covariance3
 
     def split(self, x: float, y: float) -> "list[Component]":
-        """Three components that are narrower along a direction of the field (a unit vector)."""
+        """Components that are narrower along a direction of the field (a unit vector)."""
         column = self.covariance.times((x, y, 0.0))
         sigma = math.sqrt(x * column[0] + y * column[1])
         step = column[0] / sigma, column[1] / sigma, column[2] / sigma
@@ -57,7 +58,7 @@ class Component(NamedTuple):
         ]
 
     def split_along_arc(self) -> "list[Component]":
-        """Three components with narrower headings, along the arc on which an uncertain heading
+        """Components with narrower headings, along the arc on which an uncertain heading
         puts the position."""
         arc = Arc.of(Estimate(self.pose, self.covariance))
         turn_variance = arc.covariance.hh
@@ -155,21 +156,35 @@ def moments(components: Sequence[Component]) -> tuple[Pose2, Covariance3]:
 
 def merged(components: Iterable[Component]) -> tuple[Component, ...]:
     """The mixture with weights of the sum 1, without components that hardly count, and with those
-    as one that are nearly the same, as both of them see it."""
+    as one that are nearly the same, as both of them see it: nearly enough that few are left."""
     heaviest_first = sorted(components, key=lambda c: -c.weight)
     least = LEAST_WEIGHT * sum(c.weight for c in heaviest_first)
-    left = [(c, c.covariance.inverse()) for c in heaviest_first if c.weight > least]
-    total, found = sum(c.weight for c, _ in left), []
+    left = [c for c in heaviest_first if c.weight > least]
+    total, same = sum(c.weight for c in left), SAME
+    left = _with_same_as_one([c._replace(weight=c.weight / total) for c in left], same)
+    while len(left) > MOST_KEPT:
+        same *= COARSER
+        left = _with_same_as_one(sorted(left, key=lambda c: -c.weight), same)
+    return tuple(left)
+
+
+def _with_same_as_one(heaviest_first: Sequence[Component], same: float) -> list[Component]:
+    """Each of the heaviest with all whose squared Mahalanobis distance is less, as one."""
+    left = [(*c.pose, c, c.covariance.inverse()) for c in heaviest_first]
+    found: list[Component] = []
     while left:
-        (first, inverse), *_ = left
-        same: list[tuple[Component, Covariance3]] = []
-        others: list[tuple[Component, Covariance3]] = []
-        for pair in left:
-            off = pose_difference(first.pose, pair[0].pose)
-            is_same = dot(off, inverse.times(off)) < SAME and dot(off, pair[1].times(off)) < SAME
-            (same if is_same else others).append(pair)
-        alike = [c for c, _ in same]
-        weight = sum(c.weight for c in alike)
-        found.append(Component(weight / total, *moments(alike)))
+        x, y, heading, first, inverse = left[0]
+        reach = same * (first.covariance.xx + first.covariance.yy)  # farther ones are not the same
+        alike: list[Component] = []
+        others: list[tuple[float, float, float, Component, Covariance3]] = []
+        for one in left:
+            dx, dy = one[0] - x, one[1] - y
+            if dx * dx + dy * dy < reach:
+                off = dx, dy, wrap_angle(one[2] - heading)
+                if dot(off, inverse.times(off)) < same and dot(off, one[4].times(off)) < same:
+                    alike.append(one[3])
+                    continue
+            others.append(one)
+        found.append(Component(sum(c.weight for c in alike), *moments(alike)))
         left = others
-    return tuple(found)
+    return found

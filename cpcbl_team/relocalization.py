@@ -302,7 +302,7 @@ def _with_drift(fit: Fit, noise: OdometryNoise) -> tuple[float, Estimate]:
     around its path, and around the better one."""
     pose = fit.pose
     for _ in range(2):
-        covariance, offset, cost = _filtered(pose, fit.used, noise)
+        covariance, offset, cost = _filtered(pose, fit.used, noise)[:3]
         pose = offset_pose(pose, offset, POSE)
     return cost, Estimate(pose, covariance)
 
@@ -315,13 +315,13 @@ def _filtered(pose: Pose2, used: list[PropagatedEvidence], noise: OdometryNoise)
     for piece in (*used, None):
         then = pose if piece is None else pose @ piece.now_from_then
         if last is not None:
-            covariance, (x, y, heading), cost = state
+            covariance, (x, y, heading) = state[:2]
             dx, dy, turn = then.x - last.x, then.y - last.y, then.heading - last.heading
             offset = x - dy * heading, y + dx * heading, heading
             covariance = covariance.transformed((1.0, 0.0, -dy, 0.0, 1.0, dx, 0.0, 0.0, 1.0))
             way = math.hypot(dx, dy)
             drift = motion_noise(last.heading, way, wrap_angle(turn), noise)
-            state = FilteredOffset(covariance.plus(drift, DRIFT_FACTOR), offset, cost)
+            state = state._replace(covariance=covariance.plus(drift, DRIFT_FACTOR), offset=offset)
         last = then
         if piece is not None:
             state = state.after(piece.rows_without_drift(then))
@@ -362,7 +362,7 @@ def _profile(
     """(chi-square, offset) of the best pose among those that are so far along an axis."""
     offset, least = row_sum((0.0, 0.0, 0.0), axis, goal), math.nan
     for _ in range(3):
-        covariance, step, least = _filtered(offset_pose(origin, offset, POSE), used, noise)
+        covariance, step, least = _filtered(offset_pose(origin, offset, POSE), used, noise)[:3]
         towards = covariance.times(axis)
         along = dot(axis, towards)
         if along <= 0.0:

@@ -1,6 +1,7 @@
 """Robots that hardly know their pose and see objects that give one reading each."""
 
 import math
+from collections.abc import Iterable
 
 import numpy as np
 import pytest
@@ -21,13 +22,22 @@ from support.core import (
 from support.sweeps import over_seeds
 
 from cpcbl_launch.reporting.metrics import Samples, Score, score
+from cpcbl_team import mixture_update
 from cpcbl_team.config import Field, Gives, Landmark, OdometrySettings, SensorSettings, Start
 from cpcbl_team.estimate import Estimate
 from cpcbl_team.geometry import Pose2, step
 from cpcbl_team.inputs import Odometry, Sighting, Sightings
 from cpcbl_team.localizer import Localizer
+from cpcbl_team.mixture_update import MOST_WORK, OWN_WORK
 from cpcbl_team.motion import motion_noise, move
-from cpcbl_team.pose_mixtures import Component, PoseMixture, merged, moments
+from cpcbl_team.pose_mixtures import (
+    MOST_KEPT,
+    NARROWER,
+    Component,
+    PoseMixture,
+    merged,
+    moments,
+)
 from cpcbl_team.state import State
 
 ODOMETRY, SENSOR = OdometrySettings(), SensorSettings()
@@ -124,7 +134,8 @@ def test_parts_of_a_component_have_its_moments(seed: int, heading: float, across
     assert matrix3(after) == pytest.approx(matrix3(covariance), abs=1e-9)
     row = math.cos(across), math.sin(across), 0.0
     narrower = np.array(row) @ matrix3(parts[0].covariance) @ np.array(row)
-    assert narrower == pytest.approx(0.5 * np.array(row) @ matrix3(covariance) @ np.array(row))
+    whole_variance = np.array(row) @ matrix3(covariance) @ np.array(row)
+    assert narrower == pytest.approx(NARROWER * whole_variance)
 
 
 @given(seeds_of_priors)
@@ -140,6 +151,47 @@ def test_what_is_nearly_the_same_becomes_one_with_the_same_moments(seed: int) ->
     (pose, covariance), (was, covariance_was) = moments(after), moments(before)
     assert pose == pytest.approx(was, abs=1e-9)
     assert matrix3(covariance) == pytest.approx(matrix3(covariance_was), abs=1e-9)
+
+
+def test_few_components_are_kept_and_have_the_moments_of_all() -> None:
+    """Of 600 that are far apart."""
+    rng, narrow = np.random.default_rng(0), diagonal(0.05, 0.05)
+    before = [
+        Component(float(rng.uniform(0.1, 1.0)), Pose2(x, y, 0.0), narrow)
+        for x, y in rng.uniform(0.0, 8.0, size=(600, 2)).tolist()
+    ]
+    after = merged(before)
+    assert 0.3 * MOST_KEPT < len(after) <= MOST_KEPT
+    (pose, covariance), (was, covariance_was) = moments(after), moments(before)
+    assert pose == pytest.approx(was, abs=1e-9)
+    assert matrix3(covariance) == pytest.approx(matrix3(covariance_was), abs=1e-9)
+
+
+@over_seeds(2, 20)
+@pytest.mark.parametrize("gives", [("range",), ("bearing",), ("range", "bearing")])
+@pytest.mark.parametrize("objects", [8, 30])
+def test_a_frame_makes_few_components(
+    objects: int, gives: tuple[Gives, ...], seeds: range, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """However many objects give one reading each, and however little the robot knows."""
+    made: list[int] = []
+
+    def counted(components: Iterable[Component]) -> tuple[Component, ...]:
+        each = list(components)
+        made.append(len(each))
+        return merged(each)
+
+    monkeypatch.setattr(mixture_update, "merged", counted)
+    places = np.random.default_rng(0).uniform((-1.0, -1.0), (9.0, 7.0), size=(objects, 2)).tolist()
+    landmarks = {
+        f"l{k}": Landmark(x_m=x, y_m=y, gives=gives[k % len(gives)])
+        for k, (x, y) in enumerate(places)
+    }
+    rows = [row for s in seeds for row in run(landmarks, 1.0, 45.0, 0.0, s)]
+    assert max(made) > 50
+    assert max(made) <= max(MOST_KEPT, MOST_WORK / (OWN_WORK + objects))
+    kept = [len(s.mixture.components) for s, _ in rows if s.mixture is not None]
+    assert max(kept, default=0) <= MOST_KEPT
 
 
 @given(angles, st.floats(-1.0, 1.0), st.floats(-1.0, 1.0))
