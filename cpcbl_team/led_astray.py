@@ -20,14 +20,14 @@ from cpcbl_team.estimate import Estimate, Sums, pose_difference
 from cpcbl_team.fusion import Observation, mark_shared, merge_split
 from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.hypotheses import with_gains, with_hypotheses
-from cpcbl_team.mean_comparisons import CONFLICT_OF_MOST
-from cpcbl_team.mean_offsets import CONFLICT, FAST_COMMON_M
+from cpcbl_team.mean_offsets import FAST_COMMON_M
 from cpcbl_team.measurements import GatedObject
 from cpcbl_team.miscalibration import noise_with_factor
 from cpcbl_team.own_pose import LONGEST_NS, OwnPose
+from cpcbl_team.own_pose_conflicts import own_pose_conflict
 from cpcbl_team.parameters import Sensitivity, sensitivity_dot
 from cpcbl_team.recovery_evidence import without_senders
-from cpcbl_team.sender_comparisons import RECENT_NS, SenderRecords
+from cpcbl_team.sender_comparisons import SenderRecords
 from cpcbl_team.sender_records import (
     BY_COMPARISON,
     CONTRADICTING_NIS,
@@ -109,6 +109,7 @@ class OwnPoses:
         hypothesis is updated, if there is one. `least_sigma_m`: of the part of the noise that all
         its reports have in common. `sensitivities`: to the errors that own sightings have in
         common."""
+        state = self.without_misleading(state)
         own = state.memory.teammates.own
         pose = None if own is None else own.by_sender.get(sender)
         if own is None or pose is None or self._present(state) is None:
@@ -169,13 +170,15 @@ class OwnPoses:
         return state.stamp_ns - state.odometry_until_ns > GUESSED_NS
 
     def without_misleading(self, state: State) -> State:
-        """The state after a frame was used: at its own pose, if help led it away from there."""
-        teammates, now_ns = state.memory.teammates, state.stamp_ns
-        own = teammates.own
-        if own is None or own.stamp_ns != now_ns or state.lost:
+        """The state after a frame was used, or before a report: at its own pose, if help led it
+        away from there. Between frames that pose follows odometry. Without this a robot that sees
+        no landmark in a turn would be carried on until it sees the next one."""
+        own = self._present(state, with_hypotheses=True)
+        if own is None:
             return state
         if own.common is not None and own.common.found != common_errors_of(state).found:
             return state  # a landmark that the robot had found stands elsewhere now
+        teammates, now_ns = state.memory.teammates, state.stamp_ns
         names = misleading(teammates.senders, state.estimate, own.estimate, now_ns)
         if not names:
             return state
@@ -220,32 +223,13 @@ def misleading(
     senders: SenderRecords, estimate: Estimate, own: Estimate, now_ns: int
 ) -> frozenset[str]:
     """The senders that led the estimate away from the pose by own sensors; none if it agrees with
-    that, or if no sender contradicts it as clearly. If these are several and most of all that were
-    heard lately, it is less likely that so many are wrong than that own sensors err by chance, so
-    twice the chi-square is needed."""
+    that, or if no sender contradicts it as clearly."""
     x, y, _ = pose_difference(own.pose, estimate.pose)
     common = FAST_COMMON_M * FAST_COMMON_M
     covariance = own.covariance.position() + Covariance2(common, 0.0, common)
     apart = covariance.mahalanobis_squared(x, y)
-    if apart <= CONFLICT:
-        return frozenset()
-    heard = {
-        name: r
-        for name, r in senders.items()
-        if name != OWN_SENSORS and now_ns - r.last_report_ns <= SILENCE_NS
-    }
-
-    def contradicting(bound: float) -> frozenset[str]:
-        return frozenset(
-            name
-            for name, r in heard.items()
-            if not r.reason and now_ns - r.last_report_ns <= RECENT_NS and r.own_nis > bound
-        )
-
-    found = contradicting(CONTRADICTING_NIS) if contradicting(CONFLICT) else frozenset[str]()
-    if len(found) > 1 and 2 * len(found) > len(heard):
-        return contradicting(CONFLICT_OF_MOST) if apart > CONFLICT_OF_MOST else frozenset()
-    return found
+    names, bound = own_pose_conflict(senders, now_ns)
+    return names if apart > bound else frozenset()
 
 
 def with_misleading(senders: SenderRecords, names: frozenset[str], now_ns: int) -> SenderRecords:

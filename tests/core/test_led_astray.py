@@ -80,6 +80,28 @@ def test_against_most_senders_own_sensors_need_twice_the_chi_square() -> None:
     assert misleading(doubtful, estimate_at(0.4), OWN, NOW_NS) == {"d"}
 
 
+def test_all_beyond_usual_noise_count_as_most_where_one_contradicts_own_sensors() -> None:
+    """A landmark came into sight after three seconds, and four correct observers said that the pose
+    by own sensors was off by three of its sigmas: one by 20, so it came into quarantine."""
+    senders = {"a": says(2.0), "b": says(8.0), "c": says(20.0), "d": says(9.0)}
+    assert misleading(senders, estimate_at(0.4), OWN, NOW_NS) == set()
+    assert misleading({**senders, "c": says(40.0)}, estimate_at(0.4), OWN, NOW_NS) == {"c"}
+    assert misleading({**senders, "b": says(3.0)}, estimate_at(0.4), OWN, NOW_NS) == {"c"}
+
+
+def test_whom_own_readings_support_leads_nobody_astray() -> None:
+    """Liars are in quarantine, and own readings are far more likely by what a correct observer says
+    than by the pose by own sensors alone: that one is off by chance."""
+    supported = {OWN_SENSORS: -10.0, "liar": -30.0}
+    for behind, found in (
+        (supported, {"d"}),
+        ({**supported, OWN_SENSORS: -4.0}, {"c", "d"}),
+        ({OWN_SENSORS: -10.0, "b": 0.0}, {"c", "d"}),  # as a liar has that was correct until now
+    ):
+        senders = {**TWO_OF_FOUR, "c": replace(says(30.0), behind=behind)}
+        assert misleading(senders, estimate_at(0.3), OWN, NOW_NS) == found
+
+
 def test_whom_they_made_look_wrong_of_late_is_released() -> None:
     blamed = {
         "a": replace(says(1.0), reason=QuarantineReason.BIASED, since_ns=NOW_NS - SECOND),
@@ -128,6 +150,19 @@ def drive(seconds: float, off_m: float = 0.0, names: Sequence[str] | None = None
         place = truth.x + off_m, truth.y
         state = ROBOT.add_fix(state, fix(*place, piece.stamp_ns, sensor_m=0.01, observer_m=0.01))
     return Driven(state, truth)
+
+
+def test_a_robot_that_sees_no_landmark_is_not_carried_on_until_it_sees_one() -> None:
+    """An echo is ahead of its estimate each time."""
+    state, truth = drive(4.0)
+    now_ns, step_ns = state.stamp_ns, SECOND // 10
+    for i in range(1, 21):
+        stamp_ns, truth = now_ns + i * step_ns, step(truth, 0.03, 0.0)
+        state = ROBOT.add_odometry(state, Odometry(stamp_ns - step_ns, stamp_ns, 0.03, 0.0))
+        x, y, _ = state.estimate.pose
+        state = ROBOT.add_fix(state, fix(x, y + 0.05, stamp_ns, sensor_m=0.01, observer_m=0.01))
+    assert state.memory.events["outvoted"] == 1
+    assert position_error(state.estimate, truth) < 0.1  # 0.57 m if only frames of landmarks decide
 
 
 @pytest.mark.parametrize(("distance", "turn"), [(0.05, 0.0), (0.0, 0.08)])

@@ -1,0 +1,59 @@
+"""Which senders contradict the pose by the robot's own sensors (`own_pose.py`) by what they report.
+
+Between two frames of landmarks that pose follows odometry alone, so it also judges reports that
+come while the robot sees no landmark: in a turn, help could carry the estimate on by its speed
+until the next landmark shows that it is elsewhere.
+"""
+
+from typing import NamedTuple
+
+from cpcbl_team.mean_comparisons import CONFLICT_OF_MOST, EVIDENCE
+from cpcbl_team.mean_offsets import CONFLICT, USUAL
+from cpcbl_team.sender_comparisons import RECENT_NS, SenderRecords
+from cpcbl_team.sender_records import CONTRADICTING_NIS, OWN_SENSORS, SILENCE_NS, SenderRecord
+
+
+class OwnPoseConflict(NamedTuple):
+    """Senders that contradict the pose by own sensors, and by which chi-square they have to."""
+
+    names: frozenset[str]
+    bound: float
+
+
+def own_pose_conflict(senders: SenderRecords, now_ns: int) -> OwnPoseConflict:
+    """The senders whose last report contradicts the pose by own sensors, if one does so clearly.
+    If several, and most of all that were heard lately, differ from it by more than usual noise, it
+    is less likely that so many are wrong than that own sensors err by chance, so twice the
+    chi-square is needed."""
+    heard = {
+        name: r
+        for name, r in senders.items()
+        if name != OWN_SENSORS and now_ns - r.last_report_ns <= SILENCE_NS
+    }
+
+    reported = {
+        name: r
+        for name, r in heard.items()
+        if not r.reason and now_ns - r.last_report_ns <= RECENT_NS
+    }
+    doubtful = sum(r.own_nis > USUAL for r in reported.values())
+    is_of_most = doubtful > 1 and 2 * doubtful > len(heard)
+
+    def contradicting(bound: float) -> frozenset[str]:
+        return frozenset(
+            name for name, r in reported.items() if r.own_nis > bound and not has_own_evidence(r)
+        )
+
+    if is_of_most:
+        return OwnPoseConflict(contradicting(CONFLICT_OF_MOST), CONFLICT_OF_MOST)
+    is_clear = bool(contradicting(CONFLICT))
+    return OwnPoseConflict(contradicting(CONTRADICTING_NIS) if is_clear else frozenset(), CONFLICT)
+
+
+def has_own_evidence(record: SenderRecord) -> bool:
+    """Whether own readings speak for what this sender reports: they are clearly more likely by its
+    pose (`hypotheses.py`) than by that of own sensors alone, and than by that of another sender.
+    Then the pose by own sensors is off by chance. The first alone is no protection, for a liar that
+    was correct until now has it."""
+    behind = record.behind
+    return behind.get(OWN_SENSORS, 0.0) < -USUAL and min(behind.values()) < -EVIDENCE
