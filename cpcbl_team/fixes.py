@@ -71,9 +71,9 @@ def fix_for(
     are their variances. The covariances are computed at the mean place of `earlier` fixes, whose
     errors are independent. Computed at the readings themselves, they would bias repeated fixes
     (Bordonaro, Willett, Bar-Shalom, Decorrelated unbiased converted measurement Kalman filter, IEEE
-    Trans. AES, 2014), and also those that are sent for what they gain, because short ranges would
-    look precise. A first fix has only its own reading: see `unbiased_range_m`. The constant
-    errors of the observer's camera (`common`) are part of the observer's error.
+    Trans. AES, 2014), and short ranges would be sent more often.
+    A first fix has only its own reading: see `unbiased_range_m`. The constant errors of the
+    observer's camera (`common`) are part of the observer's error.
     """
     range_m, bearing = sighting.range_m, sighting.bearing_rad
     if range_m is None or bearing is None or sighting_fault(sighting):

@@ -22,7 +22,6 @@ from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.hypotheses import with_gains, with_hypotheses
 from cpcbl_team.mean_offsets import FAST_COMMON_M
 from cpcbl_team.measurements import GatedObject
-from cpcbl_team.miscalibration import noise_with_factor
 from cpcbl_team.own_pose import LONGEST_NS, OwnPose
 from cpcbl_team.own_pose_conflicts import own_pose_conflict
 from cpcbl_team.parameters import Sensitivity, sensitivity_dot
@@ -57,7 +56,7 @@ class OwnPoses:
     ) -> None:
         """`common`: the errors that own sightings have in common. `gate`: the chi-square bound of
         two constraints."""
-        self._noise, self._common, self._gate = odometry, common, gate
+        self._moves, self._common, self._gate = odometry.moves, common, gate
 
     def after_frame(self, state: State, sums: Sums, accepted: Sequence[GatedObject]) -> State:
         """The state after a frame: what own sensors say of the offset of the estimate, as sums, or
@@ -165,7 +164,7 @@ class OwnPoses:
     def is_guessed(self, state: State) -> bool:
         """Whether the robot follows a guess, as before, because its odometry is missing. What
         contradicts that is nobody's fault."""
-        if state.odometry is None or not self._noise.moves:
+        if state.odometry is None or not self._moves:
             return False
         return state.stamp_ns - state.odometry_until_ns > GUESSED_NS
 
@@ -206,17 +205,13 @@ class OwnPoses:
 
     def _by_odometry(self, own: OwnPose, state: State) -> OwnPose:
         """A pose at the time of the state, by odometry."""
-        memory = state.memory.calibration
-        noise = noise_with_factor(self._noise, memory.adaptation.motion_factor)
-        return own.at(state.stamp_ns, state.odometry_from_robot, noise, memory.scales)
+        return own.at(state.stamp_ns, state.memory.calibration.scales)
 
     def _new_own_pose(self, state: State) -> OwnPose:
         """The pose by own sensors where it begins: the estimate."""
         known = state.memory.calibration
-        estimate, place = mark_shared(state.estimate), state.odometry_from_robot
-        return OwnPose(
-            state.stamp_ns, estimate, place, known.adaptation, _gaps(state), known.common
-        )
+        estimate, gaps = mark_shared(state.estimate), _gaps(state)
+        return OwnPose(state.stamp_ns, estimate, known.adaptation, gaps, known.common)
 
 
 def misleading(

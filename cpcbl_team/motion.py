@@ -10,6 +10,7 @@ from typing import Final, NamedTuple
 
 import msgspec
 
+from cpcbl_team.arcs import lever_change
 from cpcbl_team.config import OdometryNoise, OdometrySettings
 from cpcbl_team.estimate import ZERO3, Covariance3, Estimate, Matrix3, Six, circle_variance
 from cpcbl_team.geometry import Pose2, new, wrap_angle
@@ -27,6 +28,7 @@ class MotionVariance(NamedTuple):
 
 DRIFT_SHARE: Final = 0.1  # of the way: how far dead reckoning errs, roughly
 NO_VARIANCE: Final = MotionVariance(0.0, 0.0)
+AT_REST: Final = Estimate(Pose2(0.0, 0.0, 0.0), ZERO3)
 FASTEST: Final = 50.0  # m/s and rad/s: a piece of odometry that is faster is too short to tell
 
 
@@ -107,6 +109,26 @@ def move(
         shared = shared.transformed(motion_jacobian(heading, distance, turn))
     pose = new(Pose2, (x + ly, y - lx, wrap_angle(heading + turn)))
     return new(Estimate, (pose, new(Covariance3, (xx, xy, yy, xh, yh, hh)), shared))
+
+
+def rotation(c: float, s: float) -> Matrix3:
+    """The matrix that turns an error (x, y, heading) into a frame turned by an angle with this
+    cosine and sine."""
+    return c, -s, 0.0, s, c, 0.0, 0.0, 0.0, 1.0
+
+
+def after_motion(estimate: Estimate, motion: Estimate) -> Estimate:
+    """The estimate after a motion of many steps, which is with its covariance in the frame of the
+    robot before it."""
+    (x, y, heading), covariance, shared = estimate
+    way, added, _ = motion
+    c, s = cos(heading), sin(heading)
+    dx, dy = c * way.x - s * way.y, s * way.x + c * way.y
+    lever = lever_change(dx, dy)
+    covariance = covariance.transformed(lever).plus(added.transformed(rotation(c, s)))
+    shared = shared if shared is ZERO3 else shared.transformed(lever)
+    there = Pose2(x + dx, y + dy, wrap_angle(heading + way.heading))
+    return Estimate(there, covariance, shared)
 
 
 def part_of_piece(piece: Odometry, from_ns: int, until_ns: int) -> tuple[float, float, float]:

@@ -18,10 +18,25 @@ from typing import Any, Final, NamedTuple
 from cpcbl_team.augmented_update import Reading, ScoredUpdate, estimated_of, updated
 from cpcbl_team.common_errors import CommonErrors
 from cpcbl_team.config import OdometryNoise
-from cpcbl_team.estimate import Covariance3, Estimate, Sums, dot, merge, pose_difference
+from cpcbl_team.estimate import (
+    ZERO3,
+    Covariance3,
+    Estimate,
+    Sums,
+    dot,
+    merge,
+    pose_difference,
+)
 from cpcbl_team.geometry import Pose2
 from cpcbl_team.miscalibration import Adaptation
-from cpcbl_team.motion import NO_VARIANCE, MotionVariance, move
+from cpcbl_team.motion import (
+    AT_REST,
+    NO_VARIANCE,
+    MotionVariance,
+    after_motion,
+    covariance_after,
+    move,
+)
 from cpcbl_team.parameters import sensitivity_dot
 from cpcbl_team.scale_errors import EXACT, ScaleErrors
 
@@ -38,13 +53,13 @@ class OwnPose(NamedTuple):
 
     stamp_ns: int
     estimate: Estimate
-    odometry_from_robot: Pose2  # dead reckoning at that time
     adaptation: Adaptation  # the settings with which it was found
     gaps: int  # of the odometry until then
     common: CommonErrors | None = None  # what own sensors say of the errors in all their readings
     by_sender: "Mapping[str, OwnPose]" = NO_HYPOTHESES
     """The same with the reports of one contested sender each (`hypotheses.py`)."""
     contested_ns: int = 0  # when senders last contradicted each other
+    motion: Estimate = AT_REST  # since then, in the frame of the robot at that time
 
     @property
     def is_known(self) -> bool:
@@ -58,36 +73,47 @@ class OwnPose(NamedTuple):
         """Without the hypotheses."""
         return self._replace(by_sender=NO_HYPOTHESES) if self.by_sender else self
 
-    def at(
+    def after_step(
         self,
-        stamp_ns: int,
-        odometry_from_robot: Pose2,
+        distance: float,
+        turn: float,
         noise: OdometryNoise,
-        scales: ScaleErrors = EXACT,
+        crawl_s: float,
+        extra: MotionVariance,
     ) -> "OwnPose":
-        """The same later, by odometry. The path is nearly an arc, for it is short."""
-        way = self.odometry_from_robot.inverse() @ odometry_from_robot
-        distance = math.copysign(math.hypot(way.x, way.y), way.x)
-        seconds = (stamp_ns - self.stamp_ns) * 1e-9
-        extra = _of_scales(distance, way.heading, seconds, scales)
-        moved = move(self.estimate, distance, way.heading, noise, extra=extra)
-        moved = moved._replace(pose=self.estimate.pose @ way)
-        common = self.common
-        if common is not None:
-            common = common.after_motion(self.estimate.pose.heading, distance, way.heading)
-            common = common.after_time(seconds)
+        """After a step of the odometry, as in `motion.move`. Each step counts, for a turn that is
+        wrong in the middle of a way leads elsewhere than one at its beginning, and a robot that
+        turns to and fro errs more than its way from end to end tells."""
+        motion = move(self.motion, distance, turn, noise, crawl_s, extra)
         by_sender = self.by_sender
         if by_sender:
             by_sender = {
-                name: pose.at(stamp_ns, odometry_from_robot, noise, scales)
+                name: pose.after_step(distance, turn, noise, crawl_s, extra)
                 for name, pose in by_sender.items()
             }
+        return self._replace(motion=motion, by_sender=by_sender)
+
+    def at(self, stamp_ns: int, scales: ScaleErrors = EXACT) -> "OwnPose":
+        """The same after the motion until then."""
+        before, way = self.estimate, self.motion.pose
+        distance = math.copysign(math.hypot(way.x, way.y), way.x)
+        seconds = (stamp_ns - self.stamp_ns) * 1e-9
+        moved = after_motion(before, self.motion)
+        extra = _of_scales(distance, way.heading, seconds, scales)
+        if extra is not NO_VARIANCE:
+            direction = before.pose.heading + 0.5 * way.heading
+            c, s = math.cos(direction), math.sin(direction)
+            added = Covariance3(*covariance_after(ZERO3, distance, c, s, *extra))
+            moved = moved._replace(covariance=moved.covariance.plus(added))
+        common = self.common
+        if common is not None:
+            common = common.after_motion(before.pose.heading, distance, way.heading)
+            common = common.after_time(seconds)
+        by_sender = self.by_sender
+        if by_sender:
+            by_sender = {name: pose.at(stamp_ns, scales) for name, pose in by_sender.items()}
         return self._replace(
-            stamp_ns=stamp_ns,
-            estimate=moved,
-            odometry_from_robot=odometry_from_robot,
-            common=common,
-            by_sender=by_sender,
+            stamp_ns=stamp_ns, estimate=moved, motion=AT_REST, common=common, by_sender=by_sender
         )
 
     def with_evidence(self, about: Pose2, evidence: Sums) -> "OwnPose":

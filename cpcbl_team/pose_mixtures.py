@@ -11,20 +11,19 @@ import math
 from collections.abc import Iterable, Sequence
 from typing import Final, NamedTuple
 
-from cpcbl_team.arcs import Arc, lever_change
+from cpcbl_team.arcs import Arc
 from cpcbl_team.estimate import (
     ZERO3,
     Covariance3,
     Estimate,
-    Matrix3,
     Row,
     dot,
     outer,
     pose_difference,
 )
 from cpcbl_team.geometry import Pose2, wrap_angle
+from cpcbl_team.motion import AT_REST, after_motion, rotation
 
-AT_REST: Final = Estimate(Pose2(0.0, 0.0, 0.0), ZERO3)
 NARROWER: Final = 0.25  # the variance of each component of a normal distribution that is split
 _SHARES: Final = tuple(math.exp(-0.5 * k * k / (1.0 - NARROWER)) for k in range(-2, 3))
 _SPREAD: Final = sum(k * k * w for k, w in enumerate(_SHARES, -2)) / sum(_SHARES)
@@ -74,19 +73,8 @@ class Component(NamedTuple):
 
     def after_motion(self, motion: Estimate) -> "Component":
         """After a motion, which is with its covariance in the frame of the robot before it."""
-        pose, (x, y, turn) = self.pose, motion.pose
-        c, s = math.cos(pose.heading), math.sin(pose.heading)
-        dx, dy = c * x - s * y, s * x + c * y
-        led = self.covariance.transformed(lever_change(dx, dy))
-        added = motion.covariance.transformed(rotation(c, s))
-        there = Pose2(pose.x + dx, pose.y + dy, wrap_angle(pose.heading + turn))
-        return Component(self.weight, there, led.plus(added))
-
-
-def rotation(c: float, s: float) -> Matrix3:
-    """The matrix that turns an error (x, y, heading) into a frame turned by an angle with this
-    cosine and sine."""
-    return c, -s, 0.0, s, c, 0.0, 0.0, 0.0, 1.0
+        pose, covariance, _ = after_motion(Estimate(self.pose, self.covariance), motion)
+        return Component(self.weight, pose, covariance)
 
 
 def _with_step(pose: Pose2, step: Row, k: float) -> Pose2:

@@ -23,6 +23,7 @@ from cpcbl_team.state import (
     with_motion,
     with_odometry,
     with_recovery,
+    with_teammates,
 )
 from cpcbl_team.variants import JointVariant
 
@@ -127,4 +128,8 @@ class Prediction:
         if mixture is not None:
             motion = self._variant.move(mixture.motion, distance, turn, crawl_s, extra)
             state = with_mixture(state, mixture.after_motion(estimate, motion, added))
+        teammates = state.memory.teammates
+        if teammates.own is not None:
+            own = teammates.own.after_step(distance, turn, self._odometry, crawl_s, extra)
+            state = with_teammates(state, teammates._replace(own=own))
         return state, estimate

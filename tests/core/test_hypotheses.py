@@ -61,7 +61,7 @@ from cpcbl_team.trust import assess
 
 NOW_NS = 100 * SECOND
 PLACE = Pose2(1.0, 2.0, 0.3)
-OWN = OwnPose(NOW_NS, Estimate(PLACE, diagonal(0.05, 0.05)), Pose2(0.0, 0.0, 0.0), AS_CONFIGURED, 0)
+OWN = OwnPose(NOW_NS, Estimate(PLACE, diagonal(0.05, 0.05)), AS_CONFIGURED, 0)
 SHARP = Covariance2(1e-4, 0.0, 1e-4)
 NOISE = OdometrySettings(distance_sigma_m_per_sqrt_m=0.1, turn_sigma_rad_per_sqrt_m=0.1)
 START = Start(x_m=LOOP_START.x, y_m=LOOP_START.y, sigma_m=0.05)

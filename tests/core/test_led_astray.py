@@ -1,6 +1,5 @@
 """Help that leads the estimate away from where the robot's own sensors say that it is."""
 
-import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -24,7 +23,7 @@ from cpcbl_team.geometry import Pose2, step
 from cpcbl_team.inputs import Odometry
 from cpcbl_team.led_astray import misleading, with_misleading
 from cpcbl_team.miscalibration import AS_CONFIGURED
-from cpcbl_team.motion import turn_variance
+from cpcbl_team.motion import NO_VARIANCE, move
 from cpcbl_team.own_pose import OwnPose
 from cpcbl_team.scale_errors import ScaleErrors
 from cpcbl_team.sender_records import OWN_SENSORS, QuarantineReason, SenderRecord
@@ -117,7 +116,7 @@ def test_whom_they_made_look_wrong_of_late_is_released() -> None:
 
 
 def test_evidence_about_another_pose_is_the_same_evidence() -> None:
-    own = OwnPose(0, OWN, Pose2(0.0, 0.0, 0.0), AS_CONFIGURED, 0)
+    own = OwnPose(0, OWN, AS_CONFIGURED, 0)
     row, variance = (0.6, 0.8, 0.5), 0.01
     about = Pose2(1.2, 1.9, 0.35)
     here = Information.none().add(row, 0.1, variance)
@@ -128,13 +127,15 @@ def test_evidence_about_another_pose_is_the_same_evidence() -> None:
     assert found.estimate.covariance == pytest.approx(expected.estimate.covariance)
 
 
-def test_without_sensors_it_follows_odometry_and_becomes_uncertain() -> None:
-    own = OwnPose(0, OWN, Pose2(5.0, 5.0, 1.0), AS_CONFIGURED, 0)
-    place = Pose2(5.0, 5.0, 1.0) @ Pose2(0.4, 0.1, 0.2)
-    later = own.at(SECOND, place, NOISE)
-    assert later.estimate.pose == pytest.approx(OWN.pose @ Pose2(0.4, 0.1, 0.2))
-    way = math.hypot(0.4, 0.1)
-    assert later.estimate.covariance.hh == pytest.approx(0.05**2 + turn_variance(way, 0.2, NOISE))
+def test_without_sensors_it_follows_each_step_of_the_odometry_and_becomes_uncertain() -> None:
+    """It turns left and back: its turn from end to end is none."""
+    own, expected = OwnPose(0, OWN, AS_CONFIGURED, 0), OWN
+    for turn in [0.1] * 10 + [-0.1] * 10:
+        own = own.after_step(0.05, turn, NOISE, 0.0, NO_VARIANCE)
+        expected = move(expected, 0.05, turn, NOISE)
+    later = own.at(SECOND)
+    assert later.estimate.pose == pytest.approx(expected.pose)
+    assert later.estimate.covariance == pytest.approx(expected.covariance)
     assert later.estimate.position_sigma_m > OWN.position_sigma_m
     assert later.is_known
     lost = later._replace(estimate=OWN._replace(covariance=diagonal(1.0, 0.05)))
@@ -171,12 +172,12 @@ def test_scales_that_are_not_known_make_it_as_uncertain_as_the_whole_way(
 ) -> None:
     """A share of all that it drives or turns in three seconds, at least."""
     start = Pose2(0.0, 0.0, 0.0)
-    exact = OwnPose(0, Estimate(start, diagonal(0.01, 0.01)), start, AS_CONFIGURED, 0)
-    off, scales, place = exact, ScaleErrors.of_sigmas(0.1, 0.2), start
+    exact = OwnPose(0, Estimate(start, diagonal(0.01, 0.01)), AS_CONFIGURED, 0)
+    off, scales = exact, ScaleErrors.of_sigmas(0.1, 0.2)
     for i in range(1, 31):
-        place = step(place, distance, turn)
-        off = off.at(i * SECOND // 10, place, NOISE, scales)
-        exact = exact.at(i * SECOND // 10, place, NOISE)
+        off = off.after_step(distance, turn, NOISE, 0.0, NO_VARIANCE)
+        exact = exact.after_step(distance, turn, NOISE, 0.0, NO_VARIANCE)
+        off, exact = off.at(i * SECOND // 10, scales), exact.at(i * SECOND // 10)
     least = (0.1 * 30 * distance) ** 2, (0.2 * 30 * turn) ** 2
     for i, added in zip((0, 5), least, strict=True):
         assert off.estimate.covariance[i] - exact.estimate.covariance[i] >= added

@@ -228,7 +228,7 @@ def test_objects_that_the_robot_has_seen_since_are_as_the_map_says_in_the_own_po
     first, *others = marks
     state = common.with_object(common.started(Localizer(SETTINGS, field, TEAM).start(0)), first)
     known = common_errors_of(state)
-    own = OwnPose(0, state.estimate, LOOP_START, state.memory.calibration.adaptation, 0, known)
+    own = OwnPose(0, state.estimate, state.memory.calibration.adaptation, 0, known)
     assert common.own_pose_for(own, state) is own
     for name in others:
         state = common.with_object(state, name)
