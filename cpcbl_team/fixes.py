@@ -68,12 +68,11 @@ def fix_for(
     field_from_observer with the sighting. An uncertain heading bends the line of sight to an arc,
     which J does not contain, so the arc's variance along the line of sight is added to the
     observer's part. A heading of the teammate is the observer's plus the one in its frame, and so
-    are their variances. The covariances are computed at the mean place of `earlier` fixes, whose
-    errors are independent. Computed at the readings themselves, they would bias repeated fixes
-    (Bordonaro, Willett, Bar-Shalom, Decorrelated unbiased converted measurement Kalman filter, IEEE
-    Trans. AES, 2014), and short ranges would be sent more often.
-    A first fix has only its own reading: see `unbiased_range_m`. The constant errors of the
-    observer's camera (`common`) are part of the observer's error.
+    are their variances. The covariances are computed at the mean place of `earlier` fixes, with
+    independent errors. At the readings themselves they would bias repeated fixes (Bordonaro et al.,
+    Decorrelated unbiased converted measurement Kalman filter, IEEE Trans. AES, 2014), and short
+    ranges would be sent more often. A first fix has only its own reading: see `unbiased_range_m`.
+    The constant errors of the observer's camera (`common`) are part of the observer's error.
     """
     range_m, bearing = sighting.range_m, sighting.bearing_rad
     if range_m is None or bearing is None or sighting_fault(sighting):

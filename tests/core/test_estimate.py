@@ -366,19 +366,6 @@ def test_covariances_stay_covariances_through_long_histories(seed: int, alternat
         assert least_eigenvalue(covariance - shared) > tolerance
 
 
-def test_evidence_that_is_little_beside_an_estimate_still_counts() -> None:
-    """Each position has a fiftieth of the information that is there already, all of which a
-    teammate may know. A weight of at most 0.98 would use none of them."""
-    estimate = mark_shared(Estimate(Pose2(0.0, 0.0, 0.0), diagonal(0.07, 0.1)))
-    noise, known = Covariance2(0.25, 0.0, 0.25), Covariance2(1e-6, 0.0, 1e-6)
-    position = Observation(PLACE, (0.0, 0.0), noise, known)
-    for _ in range(50):
-        estimate = merge_split(mark_shared(estimate), position)
-    independent = 1.0 / (1.0 / 0.07**2 + 50.0 / 0.25)
-    assert independent < estimate.covariance.xx < 1.1 * independent
-    assert estimate.covariance.hh < 1.1 * 0.1**2
-
-
 @pytest.mark.parametrize(("merger", "honest"), [(merge_split, True), (merge_naive, False)])
 @pytest.mark.parametrize("scope", [Scope.POSE, Scope.POSITION])
 def test_the_same_teammates_error_counts_only_once(

@@ -31,7 +31,7 @@ from cpcbl_team.fixes import (
     unbiased_range_m,
     without_heading,
 )
-from cpcbl_team.fusion import mark_shared, merge_split
+from cpcbl_team.fusion import Observation, mark_shared, merge_split
 from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.geometry import Pose2
 from cpcbl_team.inputs import Fix, Sighting
@@ -168,6 +168,19 @@ def test_no_fixes_are_chosen_by_their_own_errors(
         error = np.array([known.pose.x, known.pose.y])
         squares.append(error @ np.linalg.solve(matrix2(known.covariance.position()), error))
     assert np.mean(squares) < 3.0
+
+
+def test_evidence_that_is_little_beside_an_estimate_still_counts() -> None:
+    """Each position has a fiftieth of the information that is there already, all of which a
+    teammate may know. A weight of at most 0.98 would use none of them."""
+    estimate = mark_shared(Estimate(Pose2(0.0, 0.0, 0.0), diagonal(0.07, 0.1)))
+    noise, known = Covariance2(0.25, 0.0, 0.25), Covariance2(1e-6, 0.0, 1e-6)
+    position = Observation(((1.0, 0.0, 0.0), (0.0, 1.0, 0.0)), (0.0, 0.0), noise, known)
+    for _ in range(50):
+        estimate = merge_split(mark_shared(estimate), position)
+    independent = 1.0 / (1.0 / 0.07**2 + 50.0 / 0.25)
+    assert independent < estimate.covariance.xx < 1.1 * independent
+    assert estimate.covariance.hh < 1.1 * 0.1**2
 
 
 @pytest.mark.parametrize("range_m", [1.0, 3.0])
