@@ -44,6 +44,23 @@ def test_ranges_alone_give_these_variants_no_heading(variant: Variant) -> None:
         assert list(warnings(team_of(THREE, other))) == []
 
 
+@pytest.mark.parametrize("variant", ["oval", "circular", "weighted"])
+def test_a_position_sensor_alone_gives_these_variants_no_heading(variant: Variant) -> None:
+    def robot(chosen: Variant, sees_landmarks: bool, moves: bool = True) -> RobotSettings:
+        return RobotSettings(
+            localizer=LocalizerSettings(variant=chosen),
+            sensor=SensorSettings(sees_landmarks=sees_landmarks),
+            odometry=OdometrySettings(moves=moves),
+            position_sensor=PositionSensor(),
+        )
+
+    (line,) = warnings(team_of(MARKS, robot(variant, False)))
+    assert line.startswith(f"robots.r1.localizer.variant: {variant} never learns its heading")
+    assert line.endswith("use variant joint")
+    right = robot("joint", False), robot(variant, True), robot(variant, False, moves=False)
+    assert [list(warnings(team_of(MARKS, r))) for r in right] == [[], [], []]
+
+
 @pytest.mark.parametrize("gives", ["range", "bearing"])
 def test_two_readings_at_a_time_determine_no_pose(gives: Gives) -> None:
     two = {n: Landmark(x_m=m.x_m, y_m=m.y_m, gives=gives) for n, m in MARKS.items()}

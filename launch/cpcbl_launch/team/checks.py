@@ -55,9 +55,16 @@ def warnings(team: Team) -> Iterator[str]:
                 f" {1.0 / odometry.rate_hz:.2g} s, and the robot only guesses its motion after"
                 f" {odometry.timeout_s:g} s; raise rate_hz"
             )
-        if not robot.sensor.sees_landmarks or robot.position_sensor is not None:
+        variant, sees_landmarks = robot.localizer.variant, robot.sensor.sees_landmarks and objects
+        if robot.position_sensor is not None:
+            if variant != "joint" and odometry.moves and not sees_landmarks:
+                yield (
+                    f"robots.{name}.localizer.variant: {variant} never learns its heading from"
+                    " positions alone, and loses its position with it; use variant joint"
+                )
             continue
-        variant = robot.localizer.variant
+        if not robot.sensor.sees_landmarks:
+            continue
         if team.map.gives_only_ranges and variant not in ("joint", "oval"):
             yield (
                 f"robots.{name}.localizer.variant: {variant} never learns its heading from ranges"
