@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 from msgspec.structs import replace
 
-from cpcbl_team.arcs import arc_variance
+from cpcbl_team.arcs import arc_variance, lever_change
 from cpcbl_team.common_errors import CommonErrors
 from cpcbl_team.config import SensorSettings
 from cpcbl_team.estimate import Covariance3, Estimate
@@ -107,9 +107,8 @@ def fix_for(
 def _observer_part(covariance: Covariance3, dx: float, dy: float) -> Covariance2:
     """The covariance that the observer's pose adds to that of a point at this offset from it (m, in
     the field's frame)."""
-    jacobian = (1.0, 0.0, -dy, 0.0, 1.0, dx, 0.0, 0.0, 0.0)
     arc = arc_variance(covariance.hh)
-    by_pose = covariance.transformed(jacobian).position()
+    by_pose = covariance.transformed(lever_change(dx, dy)).position()
     return by_pose + Covariance2(arc * dx * dx, arc * dx * dy, arc * dy * dy)
 
 
@@ -130,15 +129,15 @@ def _sighted_gaussian(
         of_reading = earlier is None and sighting.range_sigma_m is None
         share = sensor.range_share if of_reading else 0.0
         mean_m = unbiased_range_m(range_m, range_sigma, bearing_sigma, share)
-        turned, toward, distance = arc_width(bearing_sigma), bearing, range_m
+        turned, toward, distance_m = arc_width(bearing_sigma), bearing, range_m
     else:
-        distance = expected_m or range_m
+        distance_m = expected_m or range_m
         mean_m = range_m * math.exp(min(0.5 * bearing_sigma**2, MOST_SHIFT))
         # Of an error across, the share by which the direction is wrong is along it
         wrong = abs(off) if abs(off) > TURNED_OFF * bearing_sigma else bearing_sigma
         turned, toward = min(bearing_sigma * wrong, 1.0), bearing - off
-    along_m = math.hypot(range_sigma, distance * turned)
-    _, _, covariance = sighting_gaussian(distance, toward, along_m, bearing_sigma)
+    along_m = math.hypot(range_sigma, distance_m * turned)
+    _, _, covariance = sighting_gaussian(distance_m, toward, along_m, bearing_sigma)
     return Gaussian2(mean_m * math.cos(bearing), mean_m * math.sin(bearing), covariance), toward
 
 

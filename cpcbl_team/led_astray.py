@@ -22,7 +22,7 @@ from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.hypotheses import with_gains, with_hypotheses
 from cpcbl_team.mean_offsets import FAST_COMMON_M
 from cpcbl_team.measurements import GatedObject
-from cpcbl_team.own_pose import LONGEST_NS, OwnPose
+from cpcbl_team.own_pose import OwnPose
 from cpcbl_team.own_pose_conflicts import own_pose_conflict
 from cpcbl_team.parameters import Sensitivity, sensitivity_dot
 from cpcbl_team.recovery_evidence import without_senders
@@ -172,14 +172,14 @@ class OwnPoses:
         """The state after a frame was used, or before a report: at its own pose, if help led it
         away from there. Between frames that pose follows odometry. Without this a robot that sees
         no landmark in a turn would be carried on until it sees the next one."""
-        own = self._present(state, with_hypotheses=True)
+        teammates, now_ns = state.memory.teammates, state.stamp_ns
+        names, bound = own_pose_conflict(teammates.senders, now_ns)
+        own = self._present(state, with_hypotheses=True) if names else None
         if own is None:
             return state
         if own.common is not None and own.common.found != common_errors_of(state).found:
             return state  # a landmark that the robot had found stands elsewhere now
-        teammates, now_ns = state.memory.teammates, state.stamp_ns
-        names = misleading(teammates.senders, state.estimate, own.estimate, now_ns)
-        if not names:
+        if distance_squared(state.estimate, own.estimate) <= bound:
             return state
         recovery = without_senders(state.memory.recovery, names)
         state = with_memory(state, state.memory.counted("outvoted")._replace(recovery=recovery))
@@ -195,8 +195,7 @@ class OwnPoses:
         own, adaptation = state.memory.teammates.own, state.memory.calibration.adaptation
         if own is None or state.lost or own.adaptation != adaptation:
             return None
-        is_old = state.stamp_ns - own.stamp_ns > LONGEST_NS
-        if is_old or own.gaps != _gaps(state) or self.is_guessed(state):
+        if own.is_old(state.stamp_ns) or own.gaps != _gaps(state) or self.is_guessed(state):
             return None
         own = self._by_odometry(own if with_hypotheses else own.alone, state)
         if not own.is_known:
@@ -214,17 +213,13 @@ class OwnPoses:
         return OwnPose(state.stamp_ns, estimate, known.adaptation, gaps, known.common)
 
 
-def misleading(
-    senders: SenderRecords, estimate: Estimate, own: Estimate, now_ns: int
-) -> frozenset[str]:
-    """The senders that led the estimate away from the pose by own sensors; none if it agrees with
-    that, or if no sender contradicts it as clearly."""
+def distance_squared(estimate: Estimate, own: Estimate) -> float:
+    """How far the estimate is from the pose by own sensors: the chi-square of two degrees of
+    freedom, by the covariance of that."""
     x, y, _ = pose_difference(own.pose, estimate.pose)
     common = FAST_COMMON_M * FAST_COMMON_M
     covariance = own.covariance.position() + Covariance2(common, 0.0, common)
-    apart = covariance.mahalanobis_squared(x, y)
-    names, bound = own_pose_conflict(senders, now_ns)
-    return names if apart > bound else frozenset()
+    return covariance.mahalanobis_squared(x, y)
 
 
 def with_misleading(senders: SenderRecords, names: frozenset[str], now_ns: int) -> SenderRecords:

@@ -35,8 +35,7 @@ FASTEST: Final = 50.0  # m/s and rad/s: a piece of odometry that is faster is to
 def motion_jacobian(heading: float, distance: float, turn: float) -> Matrix3:
     """d(pose after) / d(pose before)."""
     direction = heading + 0.5 * turn
-    lx, ly = -distance * math.sin(direction), distance * math.cos(direction)
-    return 1.0, 0.0, lx, 0.0, 1.0, ly, 0.0, 0.0, 1.0
+    return lever_change(distance * math.cos(direction), distance * math.sin(direction))
 
 
 def motion_noise(

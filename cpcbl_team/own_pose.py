@@ -68,6 +68,10 @@ class OwnPose(NamedTuple):
         is_placed = estimate.position_sigma_m <= MOST_SIGMA_M
         return is_placed and estimate.heading_sigma_rad <= MOST_SIGMA_RAD
 
+    def is_old(self, stamp_ns: int) -> bool:
+        """Whether own sensors have said nothing for so long that it begins anew."""
+        return stamp_ns - self.stamp_ns > LONGEST_NS
+
     @property
     def alone(self) -> "OwnPose":
         """Without the hypotheses."""

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 from cpcbl_team.mean_comparisons import CONFLICT_OF_MOST, EVIDENCE
 from cpcbl_team.mean_offsets import CONFLICT, USUAL
-from cpcbl_team.sender_comparisons import RECENT_NS, SenderRecords
+from cpcbl_team.sender_comparisons import SenderRecords, recent_senders
 from cpcbl_team.sender_records import CONTRADICTING_NIS, OWN_SENSORS, SILENCE_NS, SenderRecord
 
 
@@ -25,26 +25,19 @@ def own_pose_conflict(senders: SenderRecords, now_ns: int) -> OwnPoseConflict:
     If several, and most of all that were heard lately, differ from it by more than usual noise, it
     is less likely that so many are wrong than that own sensors err by chance, so twice the
     chi-square is needed."""
-    heard = {
-        name: r
+    recent = dict(recent_senders(senders, now_ns, OWN_SENSORS))
+    doubtful = sum(r.own_nis > USUAL for r in recent.values())
+    heard = sum(
+        name != OWN_SENSORS and now_ns - r.last_report_ns <= SILENCE_NS
         for name, r in senders.items()
-        if name != OWN_SENSORS and now_ns - r.last_report_ns <= SILENCE_NS
-    }
-
-    reported = {
-        name: r
-        for name, r in heard.items()
-        if not r.reason and now_ns - r.last_report_ns <= RECENT_NS
-    }
-    doubtful = sum(r.own_nis > USUAL for r in reported.values())
-    is_of_most = doubtful > 1 and 2 * doubtful > len(heard)
+    )
 
     def contradicting(bound: float) -> frozenset[str]:
         return frozenset(
-            name for name, r in reported.items() if r.own_nis > bound and not has_own_evidence(r)
+            name for name, r in recent.items() if r.own_nis > bound and not has_own_evidence(r)
         )
 
-    if is_of_most:
+    if doubtful > 1 and 2 * doubtful > heard:
         return OwnPoseConflict(contradicting(CONFLICT_OF_MOST), CONFLICT_OF_MOST)
     is_clear = bool(contradicting(CONFLICT))
     return OwnPoseConflict(contradicting(CONTRADICTING_NIS) if is_clear else frozenset(), CONFLICT)

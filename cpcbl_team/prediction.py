@@ -129,7 +129,8 @@ class Prediction:
             motion = self._variant.move(mixture.motion, distance, turn, crawl_s, extra)
             state = with_mixture(state, mixture.after_motion(estimate, motion, added))
         teammates = state.memory.teammates
-        if teammates.own is not None:
-            own = teammates.own.after_step(distance, turn, self._odometry, crawl_s, extra)
+        own = teammates.own
+        if own is not None and not own.is_old(state.stamp_ns):
+            own = own.after_step(distance, turn, self._odometry, crawl_s, extra)
             state = with_teammates(state, teammates._replace(own=own))
         return state, estimate

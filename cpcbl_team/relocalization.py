@@ -12,6 +12,7 @@ from collections import Counter
 from collections.abc import Iterator
 from typing import NamedTuple
 
+from cpcbl_team.arcs import lever_change
 from cpcbl_team.config import Field, OdometryNoise
 from cpcbl_team.constraints import NEAREST_M, circle
 from cpcbl_team.constraints import heading as heading_of
@@ -318,7 +319,7 @@ def _filtered(pose: Pose2, used: list[PropagatedEvidence], noise: OdometryNoise)
             covariance, (x, y, heading) = state[:2]
             dx, dy, turn = then.x - last.x, then.y - last.y, then.heading - last.heading
             offset = x - dy * heading, y + dx * heading, heading
-            covariance = covariance.transformed((1.0, 0.0, -dy, 0.0, 1.0, dx, 0.0, 0.0, 1.0))
+            covariance = covariance.transformed(lever_change(dx, dy))
             way = math.hypot(dx, dy)
             drift = motion_noise(last.heading, way, wrap_angle(turn), noise)
             state = state._replace(covariance=covariance.plus(drift, DRIFT_FACTOR), offset=offset)

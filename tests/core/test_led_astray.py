@@ -21,10 +21,11 @@ from cpcbl_team.config import OdometrySettings, Start
 from cpcbl_team.estimate import Estimate, Information
 from cpcbl_team.geometry import Pose2, step
 from cpcbl_team.inputs import Odometry
-from cpcbl_team.led_astray import misleading, with_misleading
+from cpcbl_team.led_astray import distance_squared, with_misleading
 from cpcbl_team.miscalibration import AS_CONFIGURED
 from cpcbl_team.motion import NO_VARIANCE, move
 from cpcbl_team.own_pose import OwnPose
+from cpcbl_team.own_pose_conflicts import own_pose_conflict
 from cpcbl_team.scale_errors import ScaleErrors
 from cpcbl_team.sender_records import OWN_SENSORS, QuarantineReason, SenderRecord
 from cpcbl_team.state import State
@@ -49,43 +50,51 @@ def says(own_nis: float, *, ago_s: float = 0.1) -> SenderRecord:
     return SenderRecord(last_report_ns=NOW_NS - int(ago_s * SECOND), own_nis=own_nis)
 
 
+def misleading(
+    senders: dict[str, SenderRecord], estimate: Estimate, own: Estimate
+) -> frozenset[str]:
+    """The senders that led this estimate away from this pose by own sensors."""
+    names, bound = own_pose_conflict(senders, NOW_NS)
+    return names if distance_squared(estimate, own) > bound else frozenset()
+
+
 TWO_OF_FOUR = {"a": says(1.0), "b": says(3.0), "c": says(30.0), "d": says(20.0)}
 
 
 def test_those_that_contradict_own_sensors_led_an_estimate_astray_that_does_too() -> None:
     senders = {**TWO_OF_FOUR, OWN_SENSORS: says(0.0)}
-    assert misleading(senders, estimate_at(0.3), OWN, NOW_NS) == {"c", "d"}
-    assert misleading(senders, estimate_at(0.15), OWN, NOW_NS) == set()
+    assert misleading(senders, estimate_at(0.3), OWN) == {"c", "d"}
+    assert misleading(senders, estimate_at(0.15), OWN) == set()
 
 
 def test_nobody_is_blamed_where_nobody_contradicts_own_sensors_as_clearly_as_the_estimate() -> None:
     """Own sensors were off by chance, and a correct observer by 14."""
     senders = {**TWO_OF_FOUR, "c": says(15.0), "d": says(16.0)}
-    assert misleading(senders, estimate_at(0.3), OWN, NOW_NS) == set()
-    assert misleading({**senders, "d": says(19.0)}, estimate_at(0.3), OWN, NOW_NS) == {"c", "d"}
+    assert misleading(senders, estimate_at(0.3), OWN) == set()
+    assert misleading({**senders, "d": says(19.0)}, estimate_at(0.3), OWN) == {"c", "d"}
 
 
 def test_whoever_is_silent_or_in_quarantine_leads_nobody_astray() -> None:
     for change in (says(30.0, ago_s=5.0), replace(says(30.0), reason=QuarantineReason.BIASED)):
         senders = {**TWO_OF_FOUR, "c": change}
-        assert misleading(senders, estimate_at(0.3), OWN, NOW_NS) == {"d"}
+        assert misleading(senders, estimate_at(0.3), OWN) == {"d"}
 
 
 def test_against_most_senders_own_sensors_need_twice_the_chi_square() -> None:
     senders = {"a": says(1.0), "c": says(40.0), "d": says(50.0)}
-    assert misleading(senders, estimate_at(0.25), OWN, NOW_NS) == set()
-    assert misleading(senders, estimate_at(0.4), OWN, NOW_NS) == {"c", "d"}
+    assert misleading(senders, estimate_at(0.25), OWN) == set()
+    assert misleading(senders, estimate_at(0.4), OWN) == {"c", "d"}
     doubtful = {**senders, "c": says(30.0)}
-    assert misleading(doubtful, estimate_at(0.4), OWN, NOW_NS) == {"d"}
+    assert misleading(doubtful, estimate_at(0.4), OWN) == {"d"}
 
 
 def test_all_beyond_usual_noise_count_as_most_where_one_contradicts_own_sensors() -> None:
     """A landmark came into sight after three seconds, and four correct observers said that the pose
     by own sensors was off by three of its sigmas: one by 20, so it came into quarantine."""
     senders = {"a": says(2.0), "b": says(8.0), "c": says(20.0), "d": says(9.0)}
-    assert misleading(senders, estimate_at(0.4), OWN, NOW_NS) == set()
-    assert misleading({**senders, "c": says(40.0)}, estimate_at(0.4), OWN, NOW_NS) == {"c"}
-    assert misleading({**senders, "b": says(3.0)}, estimate_at(0.4), OWN, NOW_NS) == {"c"}
+    assert misleading(senders, estimate_at(0.4), OWN) == set()
+    assert misleading({**senders, "c": says(40.0)}, estimate_at(0.4), OWN) == {"c"}
+    assert misleading({**senders, "b": says(3.0)}, estimate_at(0.4), OWN) == {"c"}
 
 
 def test_whom_own_readings_support_leads_nobody_astray() -> None:
@@ -98,7 +107,7 @@ def test_whom_own_readings_support_leads_nobody_astray() -> None:
         ({OWN_SENSORS: -10.0, "b": 0.0}, {"c", "d"}),  # as a liar has that was correct until now
     ):
         senders = {**TWO_OF_FOUR, "c": replace(says(30.0), behind=behind)}
-        assert misleading(senders, estimate_at(0.3), OWN, NOW_NS) == found
+        assert misleading(senders, estimate_at(0.3), OWN) == found
 
 
 def test_whom_they_made_look_wrong_of_late_is_released() -> None:

@@ -23,6 +23,24 @@ class Handle(Protocol):
         """Takes the declaration back. Closing twice is allowed."""
 
 
+class Declared(Handle):
+    """Something declared. Its session keeps it in `kept` until it is closed, as an unused one would
+    end."""
+
+    def __init__(self, kept: "dict[Declared, None]", undeclare: Callable[[], object]) -> None:
+        self._kept, self._undeclare = kept, undeclare
+        kept[self] = None
+
+    @property
+    def open(self) -> bool:
+        return self in self._kept
+
+    def close(self) -> None:
+        if self.open:
+            self._kept.pop(self, None)
+            self._undeclare()
+
+
 class Publisher(Handle, Protocol):
     """Declared on one concrete key."""
 

@@ -5,7 +5,14 @@ from functools import lru_cache, partial
 from itertools import count
 from typing import Generic, NamedTuple, TypeVar
 
-from cpcbl_transport.bus import Bus, Handle, LivelinessCallback, MessageCallback, Publisher
+from cpcbl_transport.bus import (
+    Bus,
+    Declared,
+    Handle,
+    LivelinessCallback,
+    MessageCallback,
+    Publisher,
+)
 from cpcbl_transport.topics import Qos
 
 Thing = TypeVar("Thing")
@@ -15,23 +22,6 @@ MOST_CHANGES = 32  # that an index remembers
 class _Subscriber(NamedTuple):
     session: object
     on_message: MessageCallback
-
-
-class _Declared:
-    """Something declared; its session keeps it until it is closed."""
-
-    def __init__(self, session: "MemoryBus", undeclare: Callable[[], object]) -> None:
-        self._session, self._undeclare = session, undeclare
-        session.declared[self] = None
-
-    @property
-    def open(self) -> bool:
-        return self in self._session.declared
-
-    def close(self) -> None:
-        if self.open:
-            del self._session.declared[self]
-            self._undeclare()
 
 
 class MemoryHub:
@@ -50,10 +40,10 @@ class MemoryHub:
             on_change(key, alive)
 
 
-class _MemoryPublisher(_Declared):
+class _MemoryPublisher(Declared):
     def __init__(self, hub: MemoryHub, session: "MemoryBus", key: str) -> None:
-        super().__init__(session, lambda: None)
-        self._hub, self._key = hub, key
+        super().__init__(session.declared, lambda: None)
+        self._hub, self._session, self._key = hub, session, key
         self._patterns = patterns_of(key)
         self._found: list[_Subscriber] = []
         self._changes = 0  # of the subscribers, that are in what was found
@@ -83,13 +73,15 @@ class MemoryBus(Bus):
 
     def __init__(self, hub: MemoryHub) -> None:
         self._hub = hub
-        self.declared: dict[Handle, None] = {}  # in this order
+        self.declared: dict[Declared, None] = {}  # in this order
 
     def publisher(self, key: str, qos: Qos) -> Publisher:
         return _MemoryPublisher(self._hub, self, key)
 
     def subscribe(self, keys: str, on_message: MessageCallback) -> Handle:
-        return _Declared(self, self._hub.subscribers.add([keys], _Subscriber(self, on_message)))
+        return Declared(
+            self.declared, self._hub.subscribers.add([keys], _Subscriber(self, on_message))
+        )
 
     def declare_token(self, key: str) -> Handle:
         remove = self._hub.tokens.add(patterns_of(key), key)
@@ -99,10 +91,10 @@ class MemoryBus(Bus):
             if remove():
                 self._hub.notify_watchers(key, False)
 
-        return _Declared(self, close)
+        return Declared(self.declared, close)
 
     def watch_liveliness(self, keys: str, on_change: LivelinessCallback) -> Handle:
-        watcher = _Declared(self, self._hub.watchers.add([keys], on_change))
+        watcher = Declared(self.declared, self._hub.watchers.add([keys], on_change))
         for key in self._hub.tokens.find({keys}):
             on_change(key, True)
         return watcher

@@ -24,7 +24,14 @@ from typing import Any, NamedTuple
 import zenoh
 
 from cpcbl_team.errors import CpcblError
-from cpcbl_transport.bus import Bus, Handle, LivelinessCallback, MessageCallback, Publisher
+from cpcbl_transport.bus import (
+    Bus,
+    Declared,
+    Handle,
+    LivelinessCallback,
+    MessageCallback,
+    Publisher,
+)
 from cpcbl_transport.security import Credentials
 from cpcbl_transport.topics import Qos, is_json_key, namespace
 from cpcbl_transport.zenoh_config import client_config
@@ -207,26 +214,9 @@ def _open(config: Mapping[str, Any], space: str | None = None) -> "zenoh.Session
     return zenoh.open(zenoh.Config.from_json5(json.dumps(whole)))
 
 
-class _Declared:
-    """Something declared; the bus keeps it until it is closed, as an unused one would end."""
-
-    def __init__(self, bus: "ZenohBus", undeclare: Callable[[], None]) -> None:
-        self._bus, self._undeclare = bus, undeclare
-        bus.declared.add(self)
-
-    @property
-    def open(self) -> bool:
-        return self in self._bus.declared
-
-    def close(self) -> None:
-        if self.open:
-            self._bus.declared.discard(self)
-            self._undeclare()
-
-
-class _ZenohPublisher(_Declared):
+class _ZenohPublisher(Declared):
     def __init__(self, bus: "ZenohBus", publisher: "zenoh.Publisher") -> None:
-        super().__init__(bus, publisher.undeclare)
+        super().__init__(bus.declared, publisher.undeclare)
         self._publisher = publisher
         self._asked = self._matching = False
         listener = zenoh.handlers.Callback(
@@ -270,7 +260,7 @@ class ZenohBus(Bus):
 
     def __init__(self, session: "zenoh.Session") -> None:
         self._session = session
-        self.declared: set[_Declared] = set()
+        self.declared: dict[Declared, None] = {}
 
     def publisher(self, key: str, qos: Qos) -> Publisher:
         priority, when_full, reliable = qos.value
@@ -290,10 +280,10 @@ class ZenohBus(Bus):
             if sample.kind == zenoh.SampleKind.PUT:
                 on_message(str(sample.key_expr), sample.payload.to_bytes())
 
-        return _Declared(self, self._session.declare_subscriber(keys, on_sample).undeclare)
+        return Declared(self.declared, self._session.declare_subscriber(keys, on_sample).undeclare)
 
     def declare_token(self, key: str) -> Handle:
-        return _Declared(self, self._session.liveliness().declare_token(key).undeclare)
+        return Declared(self.declared, self._session.liveliness().declare_token(key).undeclare)
 
     def watch_liveliness(self, keys: str, on_change: LivelinessCallback) -> Handle:
         def on_sample(sample: "zenoh.Sample") -> None:
@@ -301,7 +291,7 @@ class ZenohBus(Bus):
 
         liveliness = self._session.liveliness()
         subscriber = liveliness.declare_subscriber(keys, on_sample, history=True)
-        return _Declared(self, subscriber.undeclare)
+        return Declared(self.declared, subscriber.undeclare)
 
     def tokens(self, keys: str) -> list[str]:
         """The liveliness tokens that are there now."""
@@ -328,7 +318,7 @@ class ZenohBus(Bus):
             on_change()
 
         declared = self._session.info.declare_link_events_listener(on_event)
-        return _Declared(self, declared.undeclare)
+        return Declared(self.declared, declared.undeclare)
 
     def close(self) -> None:
         self.declared.clear()

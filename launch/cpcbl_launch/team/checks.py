@@ -55,15 +55,15 @@ def warnings(team: Team) -> Iterator[str]:
                 f" {1.0 / odometry.rate_hz:.2g} s, and the robot only guesses its motion after"
                 f" {odometry.timeout_s:g} s; raise rate_hz"
             )
-        variant, sees_landmarks = robot.localizer.variant, robot.sensor.sees_landmarks and objects
+        variant, sees_landmarks = robot.localizer.variant, robot.sensor.sees_landmarks
         if robot.position_sensor is not None:
-            if variant != "joint" and odometry.moves and not sees_landmarks:
+            if variant != "joint" and odometry.moves and not (sees_landmarks and objects):
                 yield (
                     f"robots.{name}.localizer.variant: {variant} never learns its heading from"
                     " positions alone, and loses its position with it; use variant joint"
                 )
             continue
-        if not robot.sensor.sees_landmarks:
+        if not sees_landmarks:
             continue
         if team.map.gives_only_ranges and variant not in ("joint", "oval"):
             yield (

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import zenoh
 from zenoh import ext
 
-from cpcbl_transport.bus import Handle, LivelinessCallback
+from cpcbl_transport.bus import Declared, Handle, LivelinessCallback
 from cpcbl_transport.ros2.qos import History, QosProfile
 from cpcbl_transport.security import Credentials
 from cpcbl_transport.zenoh_bus import open_session
@@ -45,7 +45,7 @@ class RosSession:
 
     def __init__(self, session: "zenoh.Session") -> None:
         self._session = session
-        self._declared: list[_Declared] = []
+        self.declared: dict[Declared, None] = {}  # in this order
 
     @staticmethod
     def open(
@@ -104,7 +104,7 @@ class RosSession:
                 on_sample(Sample(str(sample.key_expr), sample.payload.to_bytes(), attachment))
 
         if not qos.transient_local:
-            return _Declared(self, self._session.declare_subscriber(keys, on_zenoh_sample))
+            return self._keep(self._session.declare_subscriber(keys, on_zenoh_sample))
         history = ext.HistoryConfig(detect_late_publishers=True, max_samples=max(1, qos.depth))
         advanced = ext.declare_advanced_subscriber(
             self._session,
@@ -114,10 +114,10 @@ class RosSession:
             recovery=ext.RecoveryConfig(periodic_queries=None, heartbeat=True),
             subscriber_detection=True,
         )
-        return _Declared(self, advanced)
+        return self._keep(advanced)
 
     def declare_token(self, key: str) -> Handle:
-        return _Declared(self, self._session.liveliness().declare_token(key))
+        return self._keep(self._session.liveliness().declare_token(key))
 
     def watch_liveliness(self, keys: str, on_change: LivelinessCallback) -> Handle:
         """Calls `on_change` for tokens that are there already and for every change."""
@@ -126,58 +126,35 @@ class RosSession:
             on_change(str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)
 
         liveliness = self._session.liveliness()
-        return _Declared(self, liveliness.declare_subscriber(keys, on_sample, history=True))
+        return self._keep(liveliness.declare_subscriber(keys, on_sample, history=True))
 
     def close(self) -> None:
         """Takes everything back, then closes: a session with an advanced subscriber that is still
         declared does not end in every version of Zenoh (eclipse-zenoh/zenoh-python issue 624)."""
-        for declared in reversed(self._declared[:]):
+        for declared in reversed(list(self.declared)):
             declared.close()
         if not self._session.is_closed():
             self._session.close()  # type: ignore[no-untyped-call]
 
-    def add(self, declared: "_Declared") -> None:
-        self._declared.append(declared)
-
-    def discard(self, declared: "_Declared") -> bool:
-        """Whether it was still declared."""
-        if declared not in self._declared:
-            return False
-        self._declared.remove(declared)
-        return True
+    def _keep(self, declared: Any) -> Handle:
+        return Declared(self.declared, declared.undeclare)
 
 
-class _Declared(Handle):
-    """Something declared; the session keeps it until it is closed, as an unused one would end."""
-
-    def __init__(self, session: RosSession, declared: Any) -> None:
-        self._session, self._undeclare = session, declared.undeclare
-        session.add(self)
-
-    def close(self) -> None:
-        if self._session.discard(self):
-            self._undeclare()
-
-
-class SamplePublisher(_Declared):
+class SamplePublisher(Declared):
     """Declared on one key."""
 
     def __init__(self, session: RosSession, publisher: Any) -> None:
-        super().__init__(session, publisher)
-        self._publisher, self._open = publisher, True
+        super().__init__(session.declared, publisher.undeclare)
+        self._publisher = publisher
 
     @property
     def matching(self) -> bool:
         """Whether there is a subscription at present. Of a transient local publisher it is always
         said, since later ones get its messages too."""
         status = getattr(self._publisher, "matching_status", None)
-        return self._open and (status is None or bool(status.matching))
+        return self.open and (status is None or bool(status.matching))
 
     def put(self, payload: bytes, attachment: bytes | None) -> None:
         """Publishes; nothing after it was closed."""
-        if self._open:
+        if self.open:
             self._publisher.put(payload, attachment=attachment)
-
-    def close(self) -> None:
-        self._open = False
-        super().close()
