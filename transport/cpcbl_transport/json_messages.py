@@ -48,7 +48,16 @@ def json_problem(payload: bytes, topic: Topic) -> str:
             return "NaN and Infinity are no numbers of JSON; leave the message out"
         if isinstance(error, RecursionError):
             return "it is nested too deeply"
-        return _error_text(str(error), topic)
+        return _encoding_problem(payload) or _error_text(str(error), topic)
+    return ""
+
+
+def _encoding_problem(payload: bytes) -> str:
+    """What is wrong with the text of a payload; every version of msgspec says it in other words."""
+    try:
+        payload.decode("utf-8")
+    except UnicodeDecodeError as error:
+        return f"it is no text in utf-8: {error.reason} at byte {error.start}"
     return ""
 
 
