@@ -75,6 +75,27 @@ class Frame(NamedTuple):
     seen: list[SeenLandmark]
 
 
+class SecondOrder(NamedTuple):
+    """Mean and variance of what the linear form of a reading leaves out."""
+
+    mean: float
+    variance: float
+
+
+def second_order_terms(
+    xx: float, xy: float, yy: float, c: float, s: float
+) -> tuple[SecondOrder, SecondOrder]:
+    """Of b^2 / 2 and of -a b (m^2), where a position with the covariance ((xx, xy), (xy, yy)) (m^2)
+    errs by a towards an object in the direction (c, s), and by b to the left of it. Its range is
+    longer by the first divided by its distance, and its bearing larger by the second divided by the
+    square of that (Jazwinski 1970, section 9.3)."""
+    ahead = c * c * xx + 2.0 * c * s * xy + s * s * yy
+    left = s * s * xx - 2.0 * c * s * xy + c * c * yy
+    both = (c * c - s * s) * xy + c * s * (yy - xx)
+    of_range = SecondOrder(0.5 * left, 0.5 * left * left)
+    return of_range, SecondOrder(-both, ahead * left + both * both)
+
+
 class CalibrationFilter(NamedTuple):
     """Pose and errors as they are known at one time. `errors`: what bearings are too large by
     (rad); what ranges are too short by, as a share and in metres; what distances and turns are too
@@ -290,22 +311,27 @@ class _Update:
         if distance == 0.0:
             return
         kept = [*mean], [[*row] for row in self._rows]
+        (xx, xy, *_), (_, yy, *_), *_ = self._rows
+        of_range, of_bearing = second_order_terms(xx, xy, yy, dx / distance, dy / distance)
         chi_square, readings = 0.0, 0
         if range_m is not None:
             share = 1.0 - mean[SHARE]
             along = -share * dx / distance, -share * dy / distance
             row = (0, along[0]), (1, along[1]), (SHARE, -distance), (OFFSET, -1.0)
-            residual = range_m - (share * distance - mean[OFFSET])
-            chi_square += self._update(row, residual, range_variance * factor)
+            longer, k = of_range, share / distance
+            residual = range_m - (share * distance - mean[OFFSET] + k * longer.mean)
+            variance = range_variance * factor + k * k * longer.variance
+            chi_square += self._update(row, residual, variance)
             readings += 1
         if bearing is not None:
             # Both readings are linearized at the same pose
-            of_bearing = (0, dy / squared), (1, -dx / squared), (2, -1.0), (BEARING, 1.0)
+            row_of_bearing = (0, dy / squared), (1, -dx / squared), (2, -1.0), (BEARING, 1.0)
             before, _ = kept
             expected = _atan2(dy, dx) - before[2] + before[BEARING]
-            residual = wrap_angle(bearing - expected)
-            residual -= sum([k * (mean[i] - before[i]) for i, k in of_bearing])
-            chi_square += self._update(of_bearing, residual, bearing_variance * factor)
+            residual = wrap_angle(bearing - expected) - of_bearing.mean / squared
+            residual -= sum([k * (mean[i] - before[i]) for i, k in row_of_bearing])
+            variance = bearing_variance * factor + of_bearing.variance / (squared * squared)
+            chi_square += self._update(row_of_bearing, residual, variance)
             readings += 1
         if chi_square > GATE:
             self._mean, self._rows = kept

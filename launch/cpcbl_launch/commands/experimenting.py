@@ -25,7 +25,7 @@ experiment_app = Typer(
     no_args_is_help=True,
 )
 
-FILE_WIDTH = 110
+FILE_WIDTH = 130
 
 Seeds = Annotated[int, Option(min=1, help="Runs of each case, each with its own noise.")]
 FromSeed = Annotated[int, Option(min=0, help="The first seed.")]

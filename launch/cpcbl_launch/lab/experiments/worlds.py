@@ -28,7 +28,7 @@ from cpcbl_launch.lab.experiments.runs import (
 from cpcbl_launch.lab.experiments.world_list import DURATION_S, World, worlds
 from cpcbl_launch.reporting.metrics import Floats, pose_nees, samples_with_truth, score
 from cpcbl_launch.reporting.recorder import Recorder
-from cpcbl_launch.reporting.tables import cells, table
+from cpcbl_launch.reporting.tables import cells, plural, table
 from cpcbl_launch.simulation.in_process import simulate
 from cpcbl_launch.team.overrides import Overrides, with_overrides
 from cpcbl_team.config import OdometrySettings, Start, Team
@@ -255,7 +255,7 @@ COLOURS = {"consistent": "green", "conservative": "cyan", "overconfident": "bold
 
 def tables(result: Outcome) -> Iterable[RenderableType]:
     shown = table(
-        f"position of robots in different worlds, {result.seeds} seeds",
+        f"position of robots in different worlds, {plural(result.seeds, 'seed')}",
         ("world", "variant"),
         ("RMSE m", "NEES", "±", "heading", "in 3 σ", "lost", "found", "beyond", ""),
     )
