@@ -1,6 +1,6 @@
 """Step 3 of the cycle, the general path: the constraints of each object, accepted or rejected."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 from cpcbl_team.config import LocalizationSettings
 from cpcbl_team.constraints import Constraint
@@ -55,15 +55,19 @@ class Gate:
         return state, self._gated(state, measured, scope, None)
 
     def _of_mixture(
-        self, state: State, measured: Iterable[Measurement], accepted: frozenset[str]
+        self, state: State, measured: Sequence[Measurement], accepted: frozenset[str]
     ) -> GatedObjects:
-        """The objects as they are about the estimate, and which of them the mixture accepts."""
-        objects = self._gated(state, measured, POSE, None)
-        gated = GatedObjects([], [])
+        """The objects that have updated a mixture, as they are about the estimate before, and which
+        of them it accepts; the dependent ones as they are about its estimate."""
+        objects = self._gated(state, [m for m in measured if not m.is_dependent], POSE, None)
+        mixture, gated = state.memory.mixture, GatedObjects([], [])
         for found in (*objects.accepted, *objects.rejected):
             is_accepted = found.measurement.source in accepted
             (gated.accepted if is_accepted else gated.rejected).append(found)
-        return gated
+        if mixture is not None:
+            state = state._replace(estimate=mixture.estimate)
+        others = self._gated(state, [m for m in measured if m.is_dependent], POSE, None)
+        return GatedObjects(gated.accepted + others.accepted, gated.rejected + others.rejected)
 
     def _gated(
         self,

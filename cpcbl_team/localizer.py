@@ -8,7 +8,7 @@ from typing import Final
 
 from cpcbl_team.common_error_filter import common_error_filter
 from cpcbl_team.config import CameraSettings, Field, LocalizationSettings
-from cpcbl_team.estimate import HEADING, POSE, POSITION, Estimate, Scope
+from cpcbl_team.estimate import Estimate, Scope
 from cpcbl_team.fixes import PoseObservation, from_fix, from_position_sensor
 from cpcbl_team.fusion import chi_square_bounds, mark_shared
 from cpcbl_team.gate import Gate
@@ -36,7 +36,7 @@ from cpcbl_team.measurements import (
     measurement_of,
 )
 from cpcbl_team.mended_inputs import with_mended_inputs
-from cpcbl_team.object_timers import ObjectTimers, has_passed
+from cpcbl_team.object_timers import ObjectTimers
 from cpcbl_team.own_calibration import OwnCalibration
 from cpcbl_team.prediction import Prediction
 from cpcbl_team.recovery import Recovery
@@ -65,7 +65,7 @@ from cpcbl_team.state import (
 from cpcbl_team.stationary_check import StationaryCheck
 from cpcbl_team.teammates import TeammateScreen
 from cpcbl_team.trusted_pose import agrees
-from cpcbl_team.variants import UpdateOrder, variant_of
+from cpcbl_team.variants import variant_of
 
 _NO_OBJECTS: Final = GatedObjects([], [])
 
@@ -87,7 +87,6 @@ class Localizer:
         gates = chi_square_bounds(rules.gate_probability)
         self._rules, self._gates, self._window = rules, gates, rules.lost_window
         self._has_map = field.has_surveyed
-        self._minimum_interval_ns = rules.minimum_interval_s * 1e9
         self._belief_age_ns = int(settings.collaboration.max_age_s * 1e9)
         self._timers = ObjectTimers(settings)
         self._variant = variant_of(settings, field)
@@ -124,7 +123,7 @@ class Localizer:
             state, gated = self.screen.screen_frame(state, landmarks, gated)
         prior = state.estimate
         if self._common is None:
-            estimate = self.correct(prior, landmarks, gated, scope)
+            estimate = self._corrected(state, landmarks, gated, scope)
             if prior is before:  # else it is about the best pose on its arc
                 estimate = self._relinearization.after_frame(state, gated.accepted, estimate)
         else:
@@ -162,7 +161,7 @@ class Localizer:
         recorded = recently_recorded(recovery, stamp_ns)
         unusable = self._timers.unusable(state, now)
         not_plain = self._landmarks.names if self._relinearization.is_due(state) else unusable
-        for scope in self._update_order(state):
+        for scope in self._variant.update_order(state):
             landmarks = self._landmarks.update(state, frame.sightings, scope, not_plain, recorded)
             measured: list[Measurement] = []
             faults: list[str] = []
@@ -183,23 +182,6 @@ class Localizer:
                 evidence = [common.as_evidence(state, m) for m in measured]
             state = with_recovery(state, with_measurements(state, evidence)).counted(*faults)
         return state, scope, landmarks, usable
-
-    def _update_order(self, state: State) -> UpdateOrder:
-        """The parts of the pose that may be updated now, in the order in which to try them: first
-        the one that has waited longer, at the end None (nothing). Heading and position have a timer
-        each."""
-        updates = state.updates
-        if state.has_no_heading:
-            return (None,)
-        order = self._variant.update_orders[updates.heading_is_latest]
-        least = self._minimum_interval_ns
-        if least > 0.0:
-            now = state.stamp_ns
-            position = has_passed(updates.position_ns, now, least)
-            heading = has_passed(updates.heading_ns, now, least)
-            may = {POSITION: position, HEADING: heading, POSE: position or heading}
-            order = tuple(scope for scope in order if scope is None or may[scope])
-        return order
 
     def _measure_others(
         self, state: State, sightings: Iterable[Sighting], now_ns: int
@@ -233,12 +215,18 @@ class Localizer:
 
     # Steps 4 and 5 ----------------------------------------------------------------------------
 
-    def correct(
-        self, prior: Estimate, landmarks: LandmarkUpdate, gated: GatedObjects, scope: Scope
+    def _corrected(
+        self, state: State, landmarks: LandmarkUpdate, gated: GatedObjects, scope: Scope
     ) -> Estimate:
         """Step 4: the closest points of all constraints as one Gaussian. Step 5: its merge with the
-        prior (equations 3 and 4)."""
-        return self._variant.correct(prior, landmarks, gated.accepted, scope)
+        prior (equations 3 and 4). What has updated a mixture is in its estimate."""
+        prior, accepted, mixture = state.estimate, gated.accepted, state.memory.mixture
+        if mixture is not None and mixture.updated_ns == state.stamp_ns:
+            prior = mixture.estimate
+            accepted = [found for found in accepted if found.measurement.is_dependent]
+            if not accepted:
+                return prior
+        return self._variant.correct(prior, landmarks, accepted, scope)
 
     def _with_frame(
         self,

@@ -132,13 +132,13 @@ class Relinearization:
     def as_mixture(
         self, state: State, measured: Sequence[Measurement]
     ) -> tuple[State, frozenset[str] | None]:
-        """The state with its pose as a mixture that these objects have updated, and the sources
-        that it accepts. Without a mixture, and None, if readings are linear, or if places of
-        objects have errors that the estimate may contain already."""
-        is_due = self._common is None and self.is_due(state)
-        is_due = is_due and not any(m.is_dependent for m in measured)
-        if is_due and self._mixtures.is_nonlinear(state.estimate, measured):
-            mixture, accepted = self._mixtures.after_frame(state, measured)
+        """The state with its pose as a mixture that the independent ones of these objects have
+        updated, and the sources that it accepts. Without a mixture, and None, if their readings are
+        linear. (The places of the others have errors that the estimate may contain already.)"""
+        independent = [m for m in measured if not m.is_dependent]
+        is_due = independent and self._common is None and self.is_due(state)
+        if is_due and self._mixtures.is_nonlinear(state.estimate, independent):
+            mixture, accepted = self._mixtures.after_frame(state, independent)
             return with_mixture(state, mixture), accepted
         return (state if state.memory.mixture is None else with_mixture(state, None)), None
 
@@ -176,10 +176,10 @@ class Relinearization:
     ) -> Estimate:
         """The estimate after a frame whose objects were linearized at the pose of the state; where
         they may leave a turn about one of them undetermined, with a covariance about its own
-        pose. After one that updated a mixture: its estimate."""
+        pose. (A mixture needs none.)"""
         mixture = state.memory.mixture
-        if accepted and mixture is not None and mixture.updated_ns == state.stamp_ns:
-            return mixture.estimate
+        if mixture is not None and mixture.updated_ns == state.stamp_ns:
+            return estimate
         if not self._is_bent(state) or not any(_leaves_a_turn(f.measurement) for f in accepted):
             return estimate
         return about_own_pose(estimate, state.estimate.pose)

@@ -26,6 +26,8 @@ from cpcbl_team.geometry import Pose2, wrap_angle
 from cpcbl_team.landmarks import LandmarkUpdate
 from cpcbl_team.measurements import GatedObject, combine
 from cpcbl_team.motion import NO_VARIANCE, MotionVariance, move
+from cpcbl_team.object_timers import has_passed
+from cpcbl_team.state import State
 
 UpdateOrder = tuple[Scope | None, ...]
 
@@ -38,13 +40,29 @@ class JointVariant:
     def __init__(self, settings: LocalizationSettings) -> None:
         rules = settings.localizer
         self._noise = settings.odometry
-        self.update_orders: tuple[UpdateOrder, UpdateOrder] = ((POSE, None), (POSE, None))
+        self._least_ns = rules.minimum_interval_s * 1e9
+        self._update_orders: tuple[UpdateOrder, UpdateOrder] = ((POSE, None), (POSE, None))
         """What an update is tried for, the last (None) for nothing; after an update of the
         position, and after one of the heading."""
         if rules.alternates:
-            self.update_orders = ((HEADING, POSITION, None), (POSITION, HEADING, None))
+            self._update_orders = ((HEADING, POSITION, None), (POSITION, HEADING, None))
         splits = settings.collaboration.fusion == "split-ci"
         self._merge_teammate = merge_split if splits else merge_naive
+
+    def update_order(self, state: State) -> UpdateOrder:
+        """The parts of the pose that may be updated now, in the order in which to try them: first
+        the one that has waited longer, at the end None (nothing). Heading and position have a timer
+        each."""
+        if state.has_no_heading:
+            return (None,)
+        now, updates, least = state.stamp_ns, state.updates, self._least_ns
+        order = self._update_orders[updates.heading_is_latest]
+        if least > 0.0:
+            position = has_passed(updates.position_ns, now, least)
+            heading = has_passed(updates.heading_ns, now, least)
+            may = {POSITION: position, HEADING: heading, POSE: position or heading}
+            order = tuple(scope for scope in order if scope is None or may[scope])
+        return order
 
     def scope(self, scope: Scope) -> Scope:
         """What a merge may move, where measurements of this part of the pose are used."""
