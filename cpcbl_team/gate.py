@@ -43,7 +43,7 @@ class Gate:
         measured = sorted(measurements, key=lambda m: m.source)
         state, accepted = self._relinearization.as_mixture(state, measured)
         if accepted is not None:
-            return state, self._of_mixture(state, measured, accepted)
+            return state, self._of_mixture(state, measured, accepted, scope)
         found = self._relinearization.about_best_pose(state, measured)
         if found is None:
             of_teammates = [m for m in measured if m.sender]
@@ -55,7 +55,11 @@ class Gate:
         return state, self._gated(state, measured, scope, None)
 
     def _of_mixture(
-        self, state: State, measured: Sequence[Measurement], accepted: frozenset[str]
+        self,
+        state: State,
+        measured: Sequence[Measurement],
+        accepted: frozenset[str],
+        scope: Scope,
     ) -> GatedObjects:
         """The objects that have updated a mixture, as they are about the estimate before, and which
         of them it accepts; the dependent ones as they are about its estimate."""
@@ -66,7 +70,7 @@ class Gate:
             (gated.accepted if is_accepted else gated.rejected).append(found)
         if mixture is not None:
             state = state._replace(estimate=mixture.estimate)
-        others = self._gated(state, [m for m in measured if m.is_dependent], POSE, None)
+        others = self._gated(state, [m for m in measured if m.is_dependent], scope, None)
         return GatedObjects(gated.accepted + others.accepted, gated.rejected + others.rejected)
 
     def _gated(

@@ -115,6 +115,7 @@ class Relinearization:
         depend on those of the pose."""
         self._rules, self._gates, self._common = settings.localizer, gates, common
         self._mixtures = MixtureUpdate(settings.localizer, gates)
+        self._estimates_whole_pose = settings.localizer.estimates_whole_pose_on(field)
         x0, y0, x1, y1 = field.bounds()
         squared = 0.25 * ((x1 - x0) ** 2 + (y1 - y0) ** 2)
         self._wide_variance = min(WIDE_VARIANCE, WIDE_SHARE * squared)
@@ -123,7 +124,7 @@ class Relinearization:
         """Whether a Gaussian may not be what is known of the pose: it is one along an arc only, or
         the position is so uncertain that readings may not be linear in it. (A robot that rejects
         what it measures doubts its estimate.)"""
-        if not self._rules.estimates_whole_pose:
+        if not self._estimates_whole_pose:
             return False
         xx, _, yy, _, _, hh = state.estimate.covariance
         is_due = hh > BENT_VARIANCE or xx + yy > self._wide_variance

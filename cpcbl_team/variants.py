@@ -137,7 +137,7 @@ class OvalVariant(JointVariant):
         super().__init__(settings)
         self._uncoupled = settings.localizer.paper_uncertainty
         self._scopes = {scope: scope for scope in Scope}
-        if field.gives_only_ranges and not self._uncoupled:
+        if settings.localizer.estimates_whole_pose_on(field):
             self._scopes[POSITION] = POSE
 
     def scope(self, scope: Scope) -> Scope:

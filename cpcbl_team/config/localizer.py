@@ -4,6 +4,7 @@ from typing import Annotated, Literal
 
 import msgspec
 
+from cpcbl_team.config.field import Field
 from cpcbl_team.config.table import NotNegative, Positive, Share, Table
 
 Variant = Literal["joint", "oval", "circular", "weighted"]
@@ -62,3 +63,9 @@ class LocalizerSettings(Table, frozen=True, kw_only=True):
     def estimates_whole_pose(self) -> bool:
         """Whether heading and position are one estimate, with the uncertainty of both."""
         return self.variant == "joint" and not (self.alternates or self.paper_uncertainty)
+
+    def estimates_whole_pose_on(self, field: Field) -> bool:
+        """The same on a field: where its map gives only ranges, `oval` corrects its heading by
+        them."""
+        is_oval = self.variant == "oval" and not self.paper_uncertainty
+        return self.estimates_whole_pose or (is_oval and field.gives_only_ranges)
