@@ -62,7 +62,8 @@ class Gate:
         scope: Scope,
     ) -> GatedObjects:
         """The objects that have updated a mixture, as they are about the estimate before, and which
-        of them it accepts; the dependent ones as they are about its estimate."""
+        of them it accepts; and the dependent ones that agree with its estimate. (The others tell
+        nothing: a mixture is not where its mean is.)"""
         objects = self._gated(state, [m for m in measured if not m.is_dependent], POSE, None)
         mixture, gated = state.memory.mixture, GatedObjects([], [])
         for found in (*objects.accepted, *objects.rejected):
@@ -71,7 +72,7 @@ class Gate:
         if mixture is not None:
             state = state._replace(estimate=mixture.estimate)
         others = self._gated(state, [m for m in measured if m.is_dependent], scope, None)
-        return GatedObjects(gated.accepted + others.accepted, gated.rejected + others.rejected)
+        return gated._replace(accepted=gated.accepted + others.accepted)
 
     def _gated(
         self,

@@ -77,7 +77,7 @@ class ReportedPosition(NamedTuple):
     stamp_ns: int
     x: float
     y: float
-    variance: float  # m^2, mean of the axes
+    variance: float  # m^2, of the major axis
     odometry_from_robot: Pose2
     turn_rad: float = 0.0  # the heading of the estimate minus that of odometry
     odometry_m2_per_m: float = 0.0  # variance of a distance by odometry per metre, by its settings,

@@ -14,7 +14,7 @@ from cpcbl_team import trust
 from cpcbl_team.common_error_filter import CommonErrorFilter
 from cpcbl_team.compromises import compromise, doubt_variance
 from cpcbl_team.config import LocalizationSettings
-from cpcbl_team.estimate import Covariance3, Information, Sums
+from cpcbl_team.estimate import Covariance3, Information, Sums, circle_variance
 from cpcbl_team.fixes import PoseObservation
 from cpcbl_team.fusion import Observation
 from cpcbl_team.gaussian import Covariance2, Gaussian2
@@ -251,7 +251,7 @@ class TeammateScreen:
             nis *= 2.0 / 3.0
             of_heading = heading.residuals[0], heading.noise().xx
         noise, (ex, ey) = position.noise(), position.residuals
-        variance = 0.5 * (noise.xx + noise.yy)
+        variance = circle_variance(*noise)  # it may jump along the major axis
         odometry_from_robot = state.odometry_from_robot
         turn_rad = state.estimate.pose.heading - odometry_from_robot.heading
         where = now, observation.x, observation.y, variance, odometry_from_robot, turn_rad

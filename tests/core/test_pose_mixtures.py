@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.core import (
     SECOND,
+    belief,
     covariance3,
     diagonal,
     displaced,
@@ -23,7 +24,7 @@ from support.sweeps import over_seeds
 
 from cpcbl_launch.reporting.metrics import Samples, Score, score
 from cpcbl_team import mixture_update
-from cpcbl_team.config import Field, Gives, Landmark, OdometrySettings, SensorSettings, Start
+from cpcbl_team.config import Field, Gives, Landmark, OdometrySettings, SensorSettings, Start, Variant
 from cpcbl_team.estimate import Estimate
 from cpcbl_team.geometry import Pose2, step
 from cpcbl_team.inputs import Odometry, Sighting, Sightings
@@ -54,10 +55,17 @@ def landmarks_giving(first: Gives, second: Gives) -> dict[str, Landmark]:
 
 
 def run(
-    landmarks: dict[str, Landmark], sigma_m: float, sigma_deg: float, blind_m: float, seed: int
+    landmarks: dict[str, Landmark],
+    sigma_m: float,
+    sigma_deg: float,
+    blind_m: float,
+    seed: int,
+    variant: Variant = "joint",
+    mate: Pose2 | None = None,
 ) -> list[tuple[State, Pose2]]:
     """States with true poses: after so far ahead that nothing is seen in, 20 s on a circle of 2 m
-    about (4, 3), from a start with these sigmas."""
+    about (4, 3), from a start with these sigmas. `mate`: of a teammate that stands, is seen in each
+    frame, and knows its place to 0.5 m."""
     rng, now = np.random.default_rng(seed), 0
     start = Start(
         x_m=6.0,
@@ -66,8 +74,9 @@ def run(
         sigma_m=sigma_m,
         heading_sigma_deg=sigma_deg,
     )
-    robot = localizer(field=Field(landmarks=landmarks), start=start, odometry=ODOMETRY)
+    robot = localizer(variant, Field(landmarks=landmarks), start=start, odometry=ODOMETRY)
     noise, state = sensor_noise(rng, SENSOR), robot.start(0)
+    off = rng.normal(size=2) * 0.5
     truth = displaced(state.estimate.pose, state.estimate.covariance, rng)
     found = []
     pieces = [(0.1, 0.0)] * round(blind_m / 0.1) + [(0.04, 0.02)] * 200
@@ -78,6 +87,10 @@ def run(
         now += PIECE_NS
         if turn and k % 2:
             seen = [noise(point_sighting(truth, n, p.x_m, p.y_m)) for n, p in landmarks.items()]
+            if mate is not None:
+                seen.append(noise(point_sighting(truth, "mate", mate.x, mate.y)))
+                told = belief(mate.x + off[0], mate.y + off[1], now, sigma_m=0.5)
+                state = robot.add_teammate_belief(state, told)
             state = robot.cycle(state, Sightings(now, tuple(seen)))
             found.append((state, truth))
     return found
@@ -119,6 +132,26 @@ def test_a_robot_that_hardly_knows_its_pose_is_as_certain_as_it_may_be(
     assert found.nees < 3.5
     assert found.inside_3_sigma > 0.9
     assert np.mean([bool(state.lost) for state, _ in rows]) < 0.15
+
+
+@over_seeds(6, 60, 8)
+@pytest.mark.parametrize(
+    ("landmarks", "variant"),
+    [
+        (landmarks_giving("range", "bearing"), "joint"),
+        (landmarks_giving("range", "range"), "joint"),
+        (landmarks_giving("range", "range"), "oval"),
+    ],
+    ids=["a range and a bearing", "two ranges", "two ranges, oval"],
+)
+@pytest.mark.parametrize("mate", [Pose2(4.0, 5.5, 0.0), None], ids=["with a mate", "alone"])
+def test_a_teammate_in_the_frame_makes_it_no_more_certain_than_it_may_be(
+    landmarks: dict[str, Landmark], variant: Variant, mate: Pose2 | None, seeds: range
+) -> None:
+    each = [run(landmarks, 1.0, 45.0, 0.0, s, variant, mate) for s in seeds]
+    rows = [row for one in each for row in one]
+    found = scored(rows)
+    print(found.nees, found.inside_3_sigma, found.position_rmse_m, np.mean([bool(state.lost) for state, _ in rows]))
 
 
 @given(seeds_of_priors, angles, angles)

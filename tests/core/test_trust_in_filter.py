@@ -145,6 +145,22 @@ def test_correct_teammates_are_never_quarantined(seeds: range) -> None:
         assert "distrusted" not in drive.state.memory.events
 
 
+@over_seeds(6, 20)
+def test_noise_along_the_long_axis_of_fixes_is_no_jump(seeds: range) -> None:
+    """A robot that stands is seen by a sensor with poor bearings. Where the mean of both axes was
+    taken for the sigma, five of these were hardly more than three."""
+    for seed in seeds:
+        rng, robot, now = random.Random(seed), localizer(), 0
+        state = state_at(Pose2(3.0, 3.0, 0.0), diagonal(0.05, 0.05))
+        for _ in range(25 * 20):
+            now += SECOND // 25
+            seen = fix(rng.gauss(3.0, 0.02), rng.gauss(3.0, 0.2), now, observer_m=0.001)
+            sensor = 0.02**2, 0.0, 0.2**2
+            state = robot.add_fix(state, replace(seen, sensor_covariance=sensor))
+        record = state.memory.teammates.senders["mate"]
+        assert record.odometry_conflicts == 0.0, seed
+
+
 def test_a_kidnapped_robot_quarantines_nobody_and_follows_all_teammates() -> None:
     def carried(ns: int, truth: Pose2, rng: np.random.Generator) -> tuple[float, float]:
         x, y = correct(ns, truth, rng)
