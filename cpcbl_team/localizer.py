@@ -221,7 +221,7 @@ class Localizer:
         """Step 4: the closest points of all constraints as one Gaussian. Step 5: its merge with the
         prior (equations 3 and 4). What has updated a mixture is in its estimate."""
         prior, accepted, mixture = state.estimate, gated.accepted, state.memory.mixture
-        if mixture is not None and mixture.updated_ns == state.stamp_ns:
+        if accepted and mixture is not None and mixture.updated_ns == state.stamp_ns:
             prior = mixture.estimate
             accepted = [found for found in accepted if found.measurement.is_dependent]
             if not accepted:

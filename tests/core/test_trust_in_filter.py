@@ -145,11 +145,11 @@ def test_correct_teammates_are_never_quarantined(seeds: range) -> None:
         assert "distrusted" not in drive.state.memory.events
 
 
-@over_seeds(6, 20)
+@over_seeds(3, 20)
 def test_noise_along_the_long_axis_of_fixes_is_no_jump(seeds: range) -> None:
-    """A robot that stands is seen by a sensor with poor bearings. Where the mean of both axes was
-    taken for the sigma, five of these were hardly more than three."""
-    for seed in seeds:
+    """A robot that stands is seen by a sensor with poor bearings. With the mean variance of both
+    axes, noise of 3.6 sigmas along the long one was a jump of five (seeds 10 and 11)."""
+    for seed in (10 + s for s in seeds):
         rng, robot, now = random.Random(seed), localizer(), 0
         state = state_at(Pose2(3.0, 3.0, 0.0), diagonal(0.05, 0.05))
         for _ in range(25 * 20):
