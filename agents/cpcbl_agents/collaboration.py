@@ -144,6 +144,7 @@ class CollaborationAgent:
                 self.guests.notice(name, now_ns)
             case agent.BeliefSubscribers():
                 self._has_subscribers, self._last_belief = message.present, None
+                return () if self.latest is None else self._beliefs(self.latest, now_ns)
             case agent.HelpSent():
                 self._record_sent(message, now_ns)
         return ()
@@ -378,8 +379,7 @@ class CollaborationAgent:
         return number
 
     def _record_sent(self, sent: agent.HelpSent, now_ns: int) -> None:
-        message = sent.message
-        match message:
+        match message := sent.message:
             case Fix():
                 topic, to = "fix", message.robot
             case LandmarkBelief():
@@ -397,4 +397,4 @@ class CollaborationAgent:
             self._fix_memories.pop(message.robot, None)
             self._early_fixes.setdefault(message.robot, message)
         elif isinstance(message, Belief):
-            self._last_belief = None
+            self._last_belief, self._belief_ns = None, self._never_ns

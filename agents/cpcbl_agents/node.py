@@ -269,7 +269,7 @@ class Node:
         subscribed = key if self._declarations.publisher(topic, key).matching else ""
         if subscribed != self._subscribed[event]:  # another key may have other subscribers
             self._subscribed[event] = subscribed
-            self.robot.handle(event(bool(subscribed)), now_ns)
+            self._send(self.robot.handle(event(bool(subscribed)), now_ns), now_ns)
 
     def _check_landmark_subscribers(self, now_ns: int) -> None:
         """Tells the robot which landmarks' places teammates want to know."""

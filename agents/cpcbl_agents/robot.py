@@ -145,8 +145,7 @@ class Robot:
         if isinstance(message, SensorInput):
             return self._routed(self.sensing.handle(message, now_ns), now_ns)
         if isinstance(message, BusEvent):
-            self._handle_event(message, now_ns)
-            return []
+            return self._handle_event(message, now_ns)
         if isinstance(message, Help):  # it changes what is published at the next tick
             if frame == self.filter.frame:
                 if isinstance(message, LandmarkBelief):
@@ -164,8 +163,8 @@ class Robot:
         outgoing += [out for m in estimates for out in self.sensing.handle(m, now_ns)]
         return [m for m in (*inputs, *outgoing) if type(m) in _OUTGOING]  # type: ignore[misc]
 
-    def _handle_event(self, event: BusEvent, now_ns: int) -> None:
-        self.collaboration.handle(event, now_ns)
+    def _handle_event(self, event: BusEvent, now_ns: int) -> list[Outgoing]:
+        outgoing = self.collaboration.handle(event, now_ns)
         match event:
             case FrameSubscribers():
                 self.sensing.handle(event, now_ns)
@@ -176,6 +175,7 @@ class Robot:
                 # From now on what this robot knows may be in what its teammates publish
                 self._shared_ns = sent.stamp_ns
                 self.filter.handle(BeliefShared(sent.stamp_ns), now_ns)
+        return [m for m in outgoing if type(m) in _OUTGOING]  # type: ignore[misc]
 
     def forget_wrong_inputs(self, since_ns: int, now_ns: int) -> None:
         """Discards what the filter adapted while inputs were wrong: call it when the monitor finds

@@ -159,6 +159,14 @@ def worlds(
 def random_worlds(
     seeds: Annotated[int, Option(min=1, help="Worlds, each of its own seed.")] = 100,
     from_seed: FromSeed = 0,
+    rough: Annotated[
+        bool,
+        Option(
+            "--rough",
+            help="Calibrations and maps of which only a sigma is known; noise that is correlated;"
+            " delays, budgets, and odometry that gets lost.",
+        ),
+    ] = False,
     show: Annotated[
         Optional[int], Option(min=0, help="Print the team file of this seed, and run nothing.")
     ] = None,
@@ -170,12 +178,15 @@ def random_worlds(
     """Random teams with settings that are right: who errs more than it says, and false alarms."""
     from cpcbl_launch.lab.experiments import random_worlds as experiment
     from cpcbl_launch.lab.experiments.random_teams import random_team
+    from cpcbl_launch.lab.experiments.rough_teams import rough_team
 
     if show is not None:
-        echo(experiment.team_text(random_team(show)), nl=False)
+        team = rough_team(show) if rough else random_team(show)
+        echo(experiment.team_text(team), nl=False)
         return
-    where = options.workers(jobs, cluster)
-    conduct(experiment.EXPERIMENT._replace(first_seed=from_seed), seeds, where, output, as_json)
+    where, cases = options.workers(jobs, cluster), partial(experiment.cases, rough)
+    chosen = experiment.EXPERIMENT._replace(cases=cases, first_seed=from_seed)
+    conduct(chosen, seeds, where, output, as_json)
 
 
 _add_command(

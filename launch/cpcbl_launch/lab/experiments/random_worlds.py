@@ -22,6 +22,7 @@ from cpcbl_agents.input_diagnosis.problems import without_numbers
 from cpcbl_agents.robot_state import robot_state
 from cpcbl_launch.calibration.team_types import non_default_settings
 from cpcbl_launch.lab.experiments.random_teams import random_team, with_drawn_starts
+from cpcbl_launch.lab.experiments.rough_teams import odometry_lost, rough_team
 from cpcbl_launch.lab.experiments.runs import Experiment, Outcome, Results, new_outcome
 from cpcbl_launch.lab.experiments.world_list import World
 from cpcbl_launch.lab.experiments.worlds import WorldRun, mean_bound, run_world
@@ -77,11 +78,11 @@ def alarm_kind(problem: str) -> str:
     return next((kind for kind in ABOUT_ONE if text.startswith(kind)), text)
 
 
-def run_random_world(case: object, seed: int) -> list[RandomRun]:
+def run_random_world(is_rough: bool, seed: int) -> list[RandomRun]:
     """One run of the team of this seed: the figures of each of its robots."""
-    team, watch = random_team(seed), AlarmWatch()
-    truth = with_drawn_starts(team, seed)
-    world = World(team, tuple(team.robots), duration_s=DURATION_S, truth=truth)
+    team, watch = rough_team(seed) if is_rough else random_team(seed), AlarmWatch()
+    truth, lost = with_drawn_starts(team, seed), odometry_lost(seed) if is_rough else 0.0
+    world = World(team, tuple(team.robots), lost, duration_s=DURATION_S, truth=truth)
     scored = zip(team.robots, run_world(world, seed, watch.attach), strict=True)
     return [
         RandomRun(
@@ -219,6 +220,11 @@ def _robot_tables(result: Outcome) -> Iterable[RenderableType]:
     yield "One world again: --from-seed SEED --seeds 1; its team file: --show SEED"
 
 
+def cases(is_rough: bool) -> dict[str, bool]:
+    """Teams whose settings are exact, or those of `rough_teams.py`."""
+    return {"rough" if is_rough else "": is_rough}
+
+
 EXPERIMENT = Experiment(
-    "random-worlds", lambda: {"": None}, outcome, tables, run_random_world, drawn=False
+    "random-worlds", lambda: {"": False}, outcome, tables, run_random_world, drawn=False
 )
