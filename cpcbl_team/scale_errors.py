@@ -20,6 +20,7 @@ from typing import Final, NamedTuple
 
 from cpcbl_team.estimate import (
     SMALLEST_VARIANCE,
+    ZERO3,
     Covariance3,
     Estimate,
     Row,
@@ -116,12 +117,19 @@ class Scale(NamedTuple):
         known = self._replace(factor=factor, error=whole / factor - 1.0, offset=left)
         return known, _times(self.offset, share)
 
-    def after_motion(self, by_share: Row, dx: float, dy: float) -> tuple["Scale", Covariance3]:
+    def after_motion(
+        self, by_share: Row, dx: float, dy: float, at_least_zero: Covariance3 | None
+    ) -> tuple["Scale", Covariance3]:
         """After a motion by (dx, dy) in the field's frame, in which a share of one moves the pose
-        by `by_share`; and what that has added to the covariance of the pose."""
+        by `by_share`; and what that has added to the covariance of the pose. `at_least_zero`: see
+        `ScaleErrors.after_motion`."""
         led = _led(self.covariance, dx, dy)
         # X g^T + g X^T, of which half of g B g^T is in each
-        added = _symmetric(row_sum(led, by_share, 0.5 * self.considered), by_share)
+        half = row_sum(led, by_share, 0.5 * self.considered)
+        if at_least_zero is None:
+            added = _symmetric(half, by_share)
+        else:
+            added = _positive_part(half, by_share, at_least_zero)
         known = self._replace(
             offset=row_sum(_led(self.offset, dx, dy), by_share, self.error),
             covariance=row_sum(led, by_share, self.considered),
@@ -209,15 +217,19 @@ class ScaleErrors(NamedTuple):
         return ScaleErrors(distance, turn, self.estimate), row_sum(by_distance, by_turn)
 
     def after_motion(
-        self, before: Estimate, distance: float, turn: float
+        self, before: Estimate, distance: float, turn: float, takes_nothing: bool = False
     ) -> tuple["ScaleErrors", Covariance3]:
         """After an arc of `distance` metres that turns by `turn` (rad), from this estimate; and
-        what the scales have added to the covariance of the pose in it."""
+        what the scales have added to the covariance of the pose in it. `takes_nothing`: this is
+        never negative. (The way back takes away what the way there has added. But where other
+        errors are estimated beside the pose, nobody knows their covariance with the scales, and
+        without it theirs with the pose would be too large then.)"""
         direction = before.pose.heading + 0.5 * turn
         dx, dy = distance * cos(direction), distance * sin(direction)
-        of_distance, added = self.distance.after_motion((dx, dy, 0.0), dx, dy)
+        at_least_zero = before.covariance if takes_nothing else None
+        of_distance, added = self.distance.after_motion((dx, dy, 0.0), dx, dy, at_least_zero)
         by_turn = -0.5 * turn * dy, 0.5 * turn * dx, turn
-        of_turn, more = self.turn.after_motion(by_turn, dx, dy)
+        of_turn, more = self.turn.after_motion(by_turn, dx, dy, at_least_zero)
         return ScaleErrors(of_distance, of_turn, self.estimate), added.plus(more)
 
     def pose_offset(self, now: Estimate, distance: float, turn: float) -> Row:
@@ -301,6 +313,18 @@ def _led(row: Row, dx: float, dy: float) -> Row:
 
 def _times(row: Row, k: float) -> Row:
     return k * row[0], k * row[1], k * row[2]
+
+
+def _positive_part(a: Row, b: Row, covariance: Covariance3) -> Covariance3:
+    """a b^T + b a^T without its negative part: it is (c c^T - d d^T) / 2 with c, d = k a +- b / k,
+    where k makes d small beside a `covariance`."""
+    position = max(covariance.xx + covariance.yy, SMALLEST_VARIANCE)
+    heading = max(covariance.hh, SMALLEST_VARIANCE)
+    of_a, of_b = ((x * x + y * y) / position + h * h / heading for x, y, h in (a, b))
+    if min(of_a, of_b) == 0.0:
+        return ZERO3
+    k = (of_b / of_a) ** 0.25
+    return outer(row_sum(_times(a, k), b, 1.0 / k)).scaled(0.5)
 
 
 def _symmetric(a: Row, b: Row) -> Covariance3:
