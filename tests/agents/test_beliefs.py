@@ -35,12 +35,28 @@ def test_without_a_subscriber_no_belief_is_sent_or_counted() -> None:
 def test_a_new_subscriber_gets_a_belief_at_once() -> None:
     alone = Alone()
     alone.later(1.0)
-    alone.tell(BeliefSubscribers(present=True))
-    assert stamps_s(alone.later(0.5)) == [1.1]
-    alone.tell(BeliefSubscribers(present=False))
+    assert stamps_s(alone.tell(BeliefSubscribers(present=True))) == [1.0]
+    assert alone.later(0.5) == []
+    assert alone.tell(BeliefSubscribers(present=False)) == []
     assert alone.later(0.2) == []
-    alone.tell(BeliefSubscribers(present=True))
-    assert stamps_s(alone.later(0.5)) == [1.8]
+    assert stamps_s(alone.tell(BeliefSubscribers(present=True))) == [1.7]
+
+
+def test_a_belief_that_nobody_heard_is_said_as_soon_as_somebody_subscribes() -> None:
+    """At a change of tier the key of beliefs changes too, and nobody has subscribed to it yet. A
+    robot whose tier changed with each of its poses was never heard, and a teammate took it to be
+    where it no longer was."""
+    alone = Alone()
+    assert alone.tell(BeliefSubscribers(present=True)) == []
+    alone.later(0.4)
+    alone.heard = False
+    poorer = alone.here.estimate._replace(covariance=diagonal(SIGMA_M[POOR], 0.02))
+    alone.becomes(estimate=poorer)
+    assert stamps_s(alone.later(0.2)) == [0.6]
+    alone.heard = True
+    assert stamps_s(alone.tell(BeliefSubscribers(present=True))) == [0.6]
+    assert stamps_s(alone.tell(BeliefSubscribers(present=True))) == []  # five a second at most
+    assert alone.tally("belief").messages == 2
 
 
 @pytest.mark.parametrize("silence_s", [0.4, 1.0, 3.0])

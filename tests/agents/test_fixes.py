@@ -152,8 +152,9 @@ def test_a_fix_without_a_subscriber_costs_nothing_and_is_offered_again() -> None
     )
     alone.tell(Presence("mate", POORER), BeliefSubscribers(present=True))
     alone.heard = False
+    alone.later(0.1)
     for _ in range(20):
-        assert len(alone.sees(ahead())) == len(alone.later(0.2)) == 1
+        assert len(alone.sees(ahead())) == len(alone.later(0.1)) == 1
     assert alone.agent.counters.flows() == ()
     alone.heard = True
     assert len(alone.sees(ahead())) == len(alone.later(0.2)) == 1

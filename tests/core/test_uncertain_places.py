@@ -14,9 +14,11 @@ from support.core import (
     Matrix,
     covariance3,
     diagonal,
+    displaced,
     driven,
     followed,
     frame,
+    least_eigenvalue,
     localizer,
     loop,
     matrix2,
@@ -24,6 +26,7 @@ from support.core import (
     point_sighting,
     position_error,
     random_matrix,
+    sensor_noise,
     state_at,
     wall_sighting,
 )
@@ -39,14 +42,17 @@ from cpcbl_team.config import (
     LocalizationSettings,
     LocalizerSettings,
     OdometrySettings,
+    SensorSettings,
     Start,
     Variant,
     Wall,
 )
 from cpcbl_team.estimate import POSE, Estimate
 from cpcbl_team.gaussian import Covariance2, Gaussian2
-from cpcbl_team.geometry import Pose2, wrap_angle
+from cpcbl_team.geometry import Pose2, step, wrap_angle
+from cpcbl_team.inputs import Odometry
 from cpcbl_team.measurements import constraints_of, measurement_of, sensitivities_of
+from cpcbl_team.motion import motion_noise
 from cpcbl_team.parameters import Parameters
 from cpcbl_team.places import map_object, moved_wall, place_covariance
 from cpcbl_team.sensors import sighting_sigmas
@@ -303,3 +309,44 @@ def test_a_turn_of_everything_stays_unknown_however_much_is_corrected() -> None:
         update.add(Reading((u, v, 1.0), ((i, -u), (i + 1, -v)), off, 0.002))
         estimate, common = update.result(estimate)
         assert estimate.covariance.hh == pytest.approx(0.04, rel=2e-3)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_places_and_scales_that_are_both_uncertain_keep_a_covariance(seed: int) -> None:
+    """A robot drives to and fro. On the way back wrong scales take away what they have added on the
+    way there; how much of that has gone into the places nobody keeps. The joint covariance of pose
+    and places became indefinite after a minute, and the robot ended."""
+    rng, now = np.random.default_rng(seed), 0
+    sensor = SensorSettings(bearing_sigma_deg=0.5, field_of_view_deg=360.0)
+    odometry = OdometrySettings(distance_scale_sigma=0.1, turn_scale_sigma=0.1)
+    places = {
+        n: replace(m, x_m=m.x_m + 0.1 * rng.normal(), y_m=m.y_m + 0.1 * rng.normal())
+        for n, m in CORNERS.landmarks.items()
+    }
+    start = Start(x_m=0.0, y_m=-1.0, sigma_m=0.05, heading_sigma_deg=3.0)
+    field, noise = uncertain(CORNERS, 0.1), sensor_noise(rng, sensor)
+    robot = localizer(field=field, start=start, sensor=sensor, odometry=odometry)
+    state, pose, squares = robot.start(0), Pose2(0.0, -1.0, 0.0), list[float]()
+    by_distance, by_turn = 1.0 + 0.1 * rng.normal(size=2)
+    for i in range(300):
+        odometer = (0.0, math.pi / 10) if i % 30 > 19 else (0.1, 0.02)
+        true = odometer[0] * by_distance, odometer[1] * by_turn
+        drift = motion_noise(pose.heading, *true, odometry)
+        pose, before, now = displaced(step(pose, *true), drift, rng), now, now + SECOND // 10
+        state = robot.add_odometry(state, Odometry(before, now, *odometer))
+        state = robot.predict(state, now)
+        seen = frame(pose, now, Field(landmarks=places), noise=noise)
+        state = robot.cycle(state, seen)
+        common = state.common_errors
+        assert common is not None
+        pose_places = np.array(common.parameters.with_pose)
+        whole = np.block(
+            [
+                [matrix3(state.estimate.covariance), pose_places.T],
+                [pose_places, np.array(common.parameters.covariance)],
+            ]
+        )
+        assert least_eigenvalue(whole) > -1e-12
+        (x, y, _), covariance, _ = state.reported
+        squares.append(covariance.position().mahalanobis_squared(x - pose.x, y - pose.y))
+    assert np.mean(squares) < 4.0

@@ -74,9 +74,10 @@ class Alone:
         self.report_estimate()
         assert self.agent.tier == tier
 
-    def tell(self, *presences: Presence | BeliefSubscribers) -> None:
-        for presence in presences:
-            assert self.agent.handle(presence, self.now_ns) == ()
+    def tell(self, *presences: Presence | BeliefSubscribers) -> list[Belief]:
+        """Robots come, go or subscribe; the beliefs that it sends because of that."""
+        said = [m for presence in presences for m in self.agent.handle(presence, self.now_ns)]
+        return self._sent(said, Belief)
 
     def becomes(self, **changes: Any) -> None:
         """So the robot will find itself from now on."""
