@@ -120,8 +120,8 @@ class Prediction:
         estimate = self._variant.move(before, distance, turn, crawl_s, extra)
         scales, added, mixture = memory.scales, ZERO3, state.mixture
         if not scales.are_exact and not state.lost:
-            is_joint = self._common is not None
-            scales, added = scales.after_motion(before, distance, turn, is_joint)
+            takes_nothing = self._common is not None or mixture is not None
+            scales, added = scales.after_motion(before, distance, turn, takes_nothing)
             covariance = estimate.covariance.plus(added)
             estimate = self._variant.reduce(estimate._replace(covariance=covariance))
             scales = scales._replace(estimate=estimate)

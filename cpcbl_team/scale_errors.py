@@ -221,9 +221,9 @@ class ScaleErrors(NamedTuple):
     ) -> tuple["ScaleErrors", Covariance3]:
         """After an arc of `distance` metres that turns by `turn` (rad), from this estimate; and
         what the scales have added to the covariance of the pose in it. `takes_nothing`: this is
-        never negative. (The way back takes away what the way there has added. But where other
-        errors are estimated beside the pose, nobody knows their covariance with the scales, and
-        without it theirs with the pose would be too large then.)"""
+        never negative. (The way back takes away what the way there has added. But nobody knows the
+        covariance of the scales with other errors that are estimated beside the pose, or with the
+        components of a mixture.)"""
         direction = before.pose.heading + 0.5 * turn
         dx, dy = distance * cos(direction), distance * sin(direction)
         at_least_zero = before.covariance if takes_nothing else None

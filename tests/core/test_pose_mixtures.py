@@ -13,6 +13,7 @@ from support.core import (
     covariance3,
     diagonal,
     displaced,
+    least_eigenvalue,
     localizer,
     matrix3,
     point_sighting,
@@ -287,6 +288,28 @@ def test_a_mixture_ends_where_something_else_corrects_the_estimate(robot: Locali
     left = moved_on.memory.mixture
     assert left is None or not left.is_of(moved_on.estimate)
     assert moved_on.reported.pose.x == pytest.approx(2.0)
+
+
+def test_the_motion_of_a_mixture_has_a_covariance_where_scales_are_uncertain() -> None:
+    """The way back takes away what wrong scales have added on the way there, which may be more than
+    the motion since the last frame has added: components were no Gaussians any more."""
+    odometry = OdometrySettings(distance_scale_sigma=0.2, turn_scale_sigma=0.1)
+    posts = Field(landmarks={"post": Landmark(x_m=3.0, y_m=0.0, gives="range")})
+    robot, now = localizer(field=posts, odometry=odometry, start=Start(x_m=0.0, y_m=0.0)), 0
+    state = robot.start(0)._replace(estimate=Estimate(Pose2(0.0, 0.0, 0.0), diagonal(0.3, 0.4)))
+    for k, (distance, turn) in enumerate([(0.1, 0.0)] * 20 + [(0.0, 0.1 * math.pi)] * 10):
+        state = robot.add_odometry(state, Odometry(now, now + PIECE_NS, distance, turn))
+        now += PIECE_NS
+        if k == 29:
+            state = robot.cycle(state, Sightings(now, (Sighting("post", 1.2, 0.0),)))
+    assert state.mixture is not None
+    for _ in range(10):
+        state = robot.add_odometry(state, Odometry(now, now + PIECE_NS, 0.1, 0.0))
+        now += PIECE_NS
+        state = robot.predict(state, now)
+        assert state.mixture is not None
+        assert least_eigenvalue(matrix3(state.mixture.motion.covariance)) > -1e-12
+    robot.cycle(state, Sightings(now, (Sighting("post", 2.2, 0.0),)))
 
 
 def test_a_frame_at_the_time_of_a_mixture_that_has_ended_updates_the_estimate() -> None:
