@@ -123,7 +123,7 @@ class Localizer:
             state, gated = self.screen.screen_frame(state, landmarks, gated)
         prior = state.estimate
         if self._common is None:
-            estimate = self._corrected(state, landmarks, gated, scope)
+            estimate = self.correct(state, landmarks, gated, scope)
             if prior is before:  # else it is about the best pose on its arc
                 estimate = self._relinearization.after_frame(state, gated.accepted, estimate)
         else:
@@ -215,7 +215,7 @@ class Localizer:
 
     # Steps 4 and 5 ----------------------------------------------------------------------------
 
-    def _corrected(
+    def correct(
         self, state: State, landmarks: LandmarkUpdate, gated: GatedObjects, scope: Scope
     ) -> Estimate:
         """Step 4: the closest points of all constraints as one Gaussian. Step 5: its merge with the
