@@ -95,6 +95,27 @@ def with_arc_width(estimate: Estimate) -> Estimate:
     return Estimate(estimate.pose, estimate.covariance.plus(added), shared)
 
 
+def with_lost_bend(estimate: Estimate) -> Estimate:
+    """The prior of an update along an arc, with the bend that its arc does not contain.
+
+    If all of the heading's error e is as old as the way, the way ends nearer by b^2 / 2 l, with b =
+    l e aside of it, and the arc contains that. But of the variance of b a turn since then, or the
+    noise on the way, leaves the share rho^2 to e alone. Then rho^4 is how much of the variance of
+    b^2 (of normal errors) e explains; the rest is added along the radius.
+    """
+    xx, xy, yy, xh, yh, hh = estimate.covariance
+    squared = xh * xh + yh * yh
+    if hh < STRAIGHT_RAD * STRAIGHT_RAD or squared == 0.0:
+        return estimate
+    aside = (xx * xh * xh + 2.0 * xy * xh * yh + yy * yh * yh) / squared
+    explained = min(squared / (aside * hh), 1.0)
+    k = arc_variance(hh) / (hh * hh) * (1.0 - explained * explained)
+    added = Covariance3(k * yh * yh, -k * xh * yh, k * xh * xh, 0.0, 0.0, 0.0)
+    shared = estimate.shared
+    shared = shared if shared is ZERO3 else shared.plus(added)
+    return Estimate(estimate.pose, estimate.covariance.plus(added), shared)
+
+
 def lever_change(dx: float, dy: float) -> Matrix3:
     """The matrix that an error (x, y, heading) is multiplied by when its pose moves by (dx, dy) and
     it stays the same turn about the origin: that turn moves the position by (-dy, dx) more."""

@@ -4,7 +4,7 @@ import math
 from collections.abc import Sequence
 from typing import Final, NamedTuple
 
-from cpcbl_team.arcs import Arc
+from cpcbl_team.arcs import Arc, with_lost_bend
 from cpcbl_team.config import LocalizerSettings
 from cpcbl_team.constraints import Constraint
 from cpcbl_team.estimate import POSE, Estimate, FilteredOffset, Row, sharpest
@@ -96,7 +96,7 @@ class MixtureUpdate:
         changes nothing."""
         mixture, estimate = state.mixture, state.estimate
         if mixture is None:
-            alone = Component(1.0, *estimate[:2])
+            alone = Component(1.0, *with_lost_bend(estimate)[:2])
             mixture = PoseMixture((alone,), estimate, state.stamp_ns)
         components, used = mixture.components_now(), list(measured)
         while used:

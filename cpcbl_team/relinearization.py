@@ -10,7 +10,7 @@ from collections.abc import Iterable, Sequence
 from typing import Final, NamedTuple
 
 from cpcbl_team.arc_fit import ArcFit, Measure, Scalar, best_fit, least_cost
-from cpcbl_team.arcs import Arc, about_own_pose, square_root
+from cpcbl_team.arcs import Arc, about_own_pose, square_root, with_lost_bend
 from cpcbl_team.common_error_filter import CommonErrorFilter
 from cpcbl_team.config import Field, LocalizationSettings, LocalizerSettings
 from cpcbl_team.constraints import TELLS_NOTHING, Constraint, curved_variance
@@ -157,7 +157,8 @@ class Relinearization:
         that nothing measures."""
         if not self._is_bent(state):
             return state, None
-        arc, objects = Arc.of(state.estimate), [m for m in measurements if not m.sender]
+        prior, objects = with_lost_bend(state.estimate), [m for m in measurements if not m.sender]
+        arc = Arc.of(prior)
         if not objects or not all(_leaves_arc(arc, m) for m in objects):
             return state, None
         measures = [self._measure(state, m) for m in objects]
@@ -170,7 +171,9 @@ class Relinearization:
             if readings and least_cost(arc, measure, gate) <= gate:
                 accepted.append(measure)
         fit = best_fit(arc, lambda pose: [s for measure in accepted for s in measure(pose)])
-        return None if fit is None else (_about(state, arc, fit.offset), Linearization(arc, fit))
+        if fit is None:
+            return None
+        return _about(state._replace(estimate=prior), arc, fit.offset), Linearization(arc, fit)
 
     def after_frame(
         self, state: State, accepted: Sequence[GatedObject], estimate: Estimate
