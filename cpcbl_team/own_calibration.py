@@ -233,7 +233,8 @@ class OwnCalibration:
         scales = memory.scales
         if not scales.are_exact:
             learned = memory.learned
-            scales = scales.with_considered(learned.distance_variance, learned.turn_variance)
+            variances = learned.distance_variance, learned.turn_variance
+            scales = scales.with_considered(*variances, state.estimate)
         return with_calibration(state, memory._replace(scales=scales))
 
     def _after_check(self, state: State) -> State:

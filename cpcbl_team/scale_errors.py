@@ -238,10 +238,14 @@ class ScaleErrors(NamedTuple):
         known = self.after_updates(now, estimates=False)
         return row_sum(known.distance.pose_offset(distance), known.turn.pose_offset(turn))
 
-    def with_considered(self, distance: float, turn: float) -> "ScaleErrors":
-        """With other variances in the covariance of the pose, of which somebody else knows."""
+    def with_considered(self, distance: float, turn: float, now: Estimate) -> "ScaleErrors":
+        """With other variances in the covariance of the pose, of which somebody else knows; `now`
+        is the estimate, whose covariance stays as it is."""
         of_distance = self.distance.with_considered(distance)
-        return ScaleErrors(of_distance, self.turn.with_considered(turn), self.estimate)
+        known = ScaleErrors(of_distance, self.turn.with_considered(turn), self.estimate)
+        if now.covariance.determinant() <= SMALLEST_VARIANCE**3:
+            return known.at_new_pose()
+        return known._bounded(now.covariance)
 
     def _bounded(self, left: Covariance3) -> "ScaleErrors":
         """Where something else has changed the covariance of the pose: no more of it than the whole

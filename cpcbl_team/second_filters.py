@@ -84,7 +84,8 @@ class SecondFilters:
         if self.scales.are_exact or (self.estimates_scales and not memory.filters):
             return state
         scales = memory.scales.after_updates(state.estimate, self.estimates_scales)
-        scales = scales.with_considered(*scale_variances(memory.filters, self.scales))
+        variances = scale_variances(memory.filters, self.scales)
+        scales = scales.with_considered(*variances, state.estimate)
         return with_calibration(state, memory._replace(scales=scales))
 
     def without_adaptation(self, state: State) -> State:

@@ -104,8 +104,8 @@ def circling(post: tuple[float, float], share: float, bearing_deg: float, seed: 
 
 
 def turned_after_a_way(gives: Gives, seed: int) -> Drive:
-    """A robot with bad odometry drives 3.5 m and turns by -100 degrees before it sees a post, or two
-    that give bearings alone, for a second."""
+    """A robot with bad odometry drives 3.5 m and turns by -100 degrees before it sees a post for a
+    second, or two that give bearings alone."""
     rng, now = np.random.default_rng(seed), 0
     odometry = OdometrySettings(turn_sigma_rad_per_sqrt_rad=0.15, turn_sigma_rad_per_sqrt_m=0.15)
     sensor = SensorSettings(bearing_sigma_deg=1.0, field_of_view_deg=360.0)
