@@ -124,10 +124,11 @@ class Localizer:
         prior = state.estimate
         if self._common is None:
             estimate = self.correct(state, landmarks, gated, scope)
-            if prior is before:  # else it is about the best pose on its arc
-                estimate = self._relinearization.after_frame(state, gated.accepted, estimate)
         else:
             state, estimate = self._common.correct(state, gated.accepted)
+        if prior is before:  # else it is about the best pose on its arc
+            accepted = gated.accepted
+            state, estimate = self._relinearization.after_frame(prior, state, accepted, estimate)
         state = self._with_frame(state, estimate, landmarks, gated, scope)
         state = self.screen.own.without_misleading(state)
         if self._stationary.is_active:

@@ -10,7 +10,7 @@ from collections.abc import Iterable, Sequence
 from typing import Final, NamedTuple
 
 from cpcbl_team.arc_fit import ArcFit, Measure, Scalar, best_fit, least_cost
-from cpcbl_team.arcs import Arc, about_own_pose, square_root, with_lost_bend
+from cpcbl_team.arcs import Arc, about_own_pose, lever_change, square_root, with_lost_bend
 from cpcbl_team.common_error_filter import CommonErrorFilter
 from cpcbl_team.config import Field, LocalizationSettings, LocalizerSettings
 from cpcbl_team.constraints import TELLS_NOTHING, Constraint, curved_variance
@@ -176,17 +176,21 @@ class Relinearization:
         return _about(state._replace(estimate=prior), arc, fit.offset), Linearization(arc, fit)
 
     def after_frame(
-        self, state: State, accepted: Sequence[GatedObject], estimate: Estimate
-    ) -> Estimate:
-        """The estimate after a frame whose objects were linearized at the pose of the state; where
-        they may leave a turn about one of them undetermined, with a covariance about its own
-        pose. (A mixture needs none.)"""
-        mixture = state.memory.mixture
-        if mixture is not None and mixture.updated_ns == state.stamp_ns:
-            return estimate
-        if not self._is_bent(state) or not any(_leaves_a_turn(f.measurement) for f in accepted):
-            return estimate
-        return about_own_pose(estimate, state.estimate.pose)
+        self, before: Estimate, state: State, accepted: Sequence[GatedObject], estimate: Estimate
+    ) -> tuple[State, Estimate]:
+        """The state and its next estimate after a frame whose objects were linearized at the pose
+        `before`; where they may leave a turn about one of them undetermined, with covariances about
+        its own pose. (A mixture needs none, and places that the robot has found have them.)"""
+        mixture, common = state.memory.mixture, state.common_errors
+        is_done = mixture is not None and mixture.updated_ns == state.stamp_ns
+        is_done |= common is not None and bool(common.found)
+        is_bent = before.covariance.hh > BENT_VARIANCE and self.is_due(state)
+        if is_done or not is_bent or not any(_leaves_a_turn(f.measurement) for f in accepted):
+            return state, estimate
+        if common is not None:
+            dx, dy = estimate.pose.x - before.pose.x, estimate.pose.y - before.pose.y
+            state = with_common_errors(state, common.with_pose_mapped(lever_change(dx, dy)))
+        return state, about_own_pose(estimate, before.pose)
 
     def _measure(self, state: State, m: Measurement) -> Measure:
         """What an object says, with the errors of its place and of the camera as noise."""
