@@ -206,4 +206,4 @@ def test_many_frames_of_one_landmark_tell_nothing_of_a_turn_about_it(
         (x, y, _), covariance, _ = state.reported
         squares.append(covariance.position().mahalanobis_squared(x - pose.x, y - pose.y))
     assert sum(sigmas[1::2]) > 0.95 * sum(sigmas[::2])
-    assert np.mean(squares) < 6.0
+    assert np.median(squares) < 2.5  # 1.4 is due
