@@ -61,6 +61,18 @@ def test_a_position_sensor_alone_gives_these_variants_no_heading(variant: Varian
     assert [list(warnings(team_of(MARKS, r))) for r in right] == [[], [], []]
 
 
+@pytest.mark.parametrize("variant", ["oval", "circular", "weighted"])
+def test_these_variants_take_a_sensor_that_may_be_turned_for_exact(variant: Variant) -> None:
+    def robot(chosen: Variant, sigma_deg: float) -> RobotSettings:
+        sensor = SensorSettings(bearing_bias_sigma_deg=sigma_deg)
+        return RobotSettings(localizer=LocalizerSettings(variant=chosen), sensor=sensor)
+
+    (line,) = warnings(team_of(MARKS, robot(variant, 2.0)))
+    assert line.startswith(f"robots.r1.sensor.bearing_bias_sigma_deg: {variant} takes")
+    right = robot("joint", 2.0), robot(variant, 0.0)
+    assert [list(warnings(team_of(MARKS, r))) for r in right] == [[], []]
+
+
 @pytest.mark.parametrize("gives", ["range", "bearing"])
 def test_two_readings_at_a_time_determine_no_pose(gives: Gives) -> None:
     two = {n: Landmark(x_m=m.x_m, y_m=m.y_m, gives=gives) for n, m in MARKS.items()}
