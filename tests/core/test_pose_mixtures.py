@@ -132,7 +132,7 @@ def test_a_robot_that_hardly_knows_its_pose_is_as_certain_as_it_may_be(
 ) -> None:
     """From the first seed on, four are enough for one Gaussian to fail in each of these worlds.
     With 60 it had a NEES of 31, 33, 3 and 55, and was inside 3 sigma for 92, 95, 97 and 86 % of
-    the time."""
+    the time. (After 10 m and a bearing the sigma of the position is 2.4 m, and 2 m are lost.)"""
     each = [(first + s) % 60 for s in seeds]
     rows = [row for s in each for row in run(landmarks, sigma_m, sigma_deg, blind_m, s)]
     found = scored(rows)
@@ -140,7 +140,7 @@ def test_a_robot_that_hardly_knows_its_pose_is_as_certain_as_it_may_be(
     assert found.inside_3_sigma is not None
     assert found.nees < 3.5
     assert found.inside_3_sigma > 0.9
-    assert np.mean([bool(state.lost) for state, _ in rows]) < 0.15
+    assert np.mean([bool(state.lost) for state, _ in rows]) < (0.3 if blind_m else 0.15)
 
 
 @over_seeds(4, 56, 8)

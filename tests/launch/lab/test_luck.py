@@ -31,10 +31,10 @@ FOUND = {
     "budget leak": ("in budget", 12),
     "fresh budget": ("in budget", 1),
     "free beliefs": ("in budget", 12),
-    "quarantine ignored": ("quarantined", 23),
+    "quarantine ignored": ("quarantined", 26),
 }
 """Planted bugs, by the invariant that finds each, and a seed whose history shows it."""
-MOST_SEEDS, MOST_EVENTS = 24, 20
+MOST_SEEDS, MOST_EVENTS = 27, 20
 IN_SUM = {"naive fusion": range(10), "trust off": range(10, 24)}
 DIGEST = "from cpcbl_launch.lab.luck.outcome import run_seed; print(run_seed(4, 8.0).digest)"
 
