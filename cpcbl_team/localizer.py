@@ -306,7 +306,10 @@ class Localizer:
             state = self._with_update(state, prior, None, {}, 1)
             return self._after_observation(state, observation)
         by_teammate = observation.observer is not None
-        if self._common is not None:
+        of_mixture = None if by_teammate else self._relinearization.after_position(state, position)
+        if of_mixture is not None:
+            state, estimate = of_mixture, of_mixture.estimate
+        elif self._common is not None:
             state, estimate = self._common.observed(state, prior, position, by_teammate)
         else:
             estimate = self._variant.correct_position(prior, position, by_teammate)

@@ -7,7 +7,15 @@ from typing import Final, NamedTuple
 from cpcbl_team.arcs import Arc, with_lost_bend
 from cpcbl_team.config import LocalizerSettings
 from cpcbl_team.constraints import Constraint
-from cpcbl_team.estimate import POSE, Estimate, FilteredOffset, Row, sharpest
+from cpcbl_team.estimate import (
+    POSE,
+    Estimate,
+    FilteredOffset,
+    Row,
+    pose_difference,
+    sharpest,
+)
+from cpcbl_team.fusion import Observation
 from cpcbl_team.geometry import Pose2, wrap_angle
 from cpcbl_team.measurements import Measurement, constraints_of, left_out
 from cpcbl_team.pose_mixtures import PARTS, Component, PoseMixture, estimate_of, merged
@@ -51,7 +59,7 @@ class _Updated(NamedTuple):
     before: Component
     after: FilteredOffset
     log_weight: float
-    nonlinearity: _Nonlinearity
+    nonlinearity: _Nonlinearity = _Nonlinearity()
 
     def parts(self) -> list[Component]:
         """The component in parts in which the least linear reading is more linear. The bend of an
@@ -114,6 +122,19 @@ class MixtureUpdate:
             used = [m for m in used if m.source in accepted]
         return mixture._replace(updated_ns=state.stamp_ns), frozenset()
 
+    def after_position(self, mixture: PoseMixture, state: State, seen: Observation) -> PoseMixture:
+        """The mixture of the state after its own position sensor, whose readings are linear.
+        `seen`: about the estimate."""
+        before, updated = state.estimate, []
+        for component in mixture.components_now():
+            about = seen.shifted(*pose_difference(before.pose, component.pose))
+            readings = about.independent_scalars(about.noise())
+            after = FilteredOffset(component.covariance).after(readings)
+            updated.append(_Updated(component, after, _log_weight(component, after)))
+        weights = _weights(updated)
+        found = merged(u.component(w) for u, w in zip(updated, weights, strict=True))
+        return PoseMixture(found, estimate_of(found, before), state.stamp_ns)
+
     def _split(
         self, components: Sequence[Component], measured: Sequence[Measurement]
     ) -> list[_Updated]:
@@ -146,8 +167,7 @@ class MixtureUpdate:
                 worst = max(worst, _nonlinearity(prior, m, c, square))
                 readings.append(reading)
         after = FilteredOffset(component.covariance).after(readings)
-        log_weight = math.log(component.weight) - 0.5 * (after.log_determinant + after.cost)
-        return _Updated(component, after, log_weight, worst)
+        return _Updated(component, after, _log_weight(component, after), worst)
 
     def _accepts(self, component: Component, m: Measurement) -> bool:
         """Whether an object agrees with a component (none does that the component touches)."""
@@ -169,6 +189,11 @@ class MixtureUpdate:
                 variance = sharpest(c.sigma * c.sigma) + square
                 found.append((c, (c.row, c.residual, variance), square))
         return found
+
+
+def _log_weight(component: Component, after: FilteredOffset) -> float:
+    """The log of a component's weight after readings."""
+    return math.log(component.weight) - 0.5 * (after.log_determinant + after.cost)
 
 
 def _weights(updated: Sequence[_Updated]) -> list[float]:

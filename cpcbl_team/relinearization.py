@@ -15,6 +15,7 @@ from cpcbl_team.common_error_filter import CommonErrorFilter
 from cpcbl_team.config import Field, LocalizationSettings, LocalizerSettings
 from cpcbl_team.constraints import TELLS_NOTHING, Constraint, curved_variance
 from cpcbl_team.estimate import POSE, ZERO3, Estimate, Row, dot, row_sum
+from cpcbl_team.fusion import Observation
 from cpcbl_team.geometry import Pose2, wrap_angle
 from cpcbl_team.measurements import GatedObject, Measurement, constraints_of
 from cpcbl_team.mixture_update import MixtureUpdate
@@ -142,6 +143,14 @@ class Relinearization:
             mixture, accepted = self._mixtures.after_frame(state, independent)
             return with_mixture(state, mixture), accepted
         return (state if state.memory.mixture is None else with_mixture(state, None)), None
+
+    def after_position(self, state: State, seen: Observation) -> State | None:
+        """The state whose mixture its own position sensor has updated; None without a mixture."""
+        mixture = state.mixture
+        if mixture is None:
+            return None
+        mixture = self._mixtures.after_position(mixture, state, seen)
+        return with_mixture(state._replace(estimate=mixture.estimate), mixture)
 
     def _is_bent(self, state: State) -> bool:
         """Whether the estimate is a Gaussian along an arc only."""
