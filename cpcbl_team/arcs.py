@@ -88,7 +88,12 @@ def with_arc_width(estimate: Estimate) -> Estimate:
     _, _, _, xh, yh, hh = estimate.covariance
     if hh < STRAIGHT_RAD * STRAIGHT_RAD or xh == yh == 0.0:
         return estimate
-    k = arc_variance(hh) / (hh * hh)
+    return _with_bend(estimate, arc_variance(hh) / (hh * hh))
+
+
+def _with_bend(estimate: Estimate, k: float) -> Estimate:
+    """With k times the squared covariance of position and heading, along the radius of its arc."""
+    _, _, _, xh, yh, _ = estimate.covariance
     added = Covariance3(k * yh * yh, -k * xh * yh, k * xh * xh, 0.0, 0.0, 0.0)
     shared = estimate.shared
     shared = shared if shared is ZERO3 else shared.plus(added)
@@ -109,11 +114,7 @@ def with_lost_bend(estimate: Estimate) -> Estimate:
         return estimate
     aside = (xx * xh * xh + 2.0 * xy * xh * yh + yy * yh * yh) / squared
     explained = min(squared / (aside * hh), 1.0)
-    k = arc_variance(hh) / (hh * hh) * (1.0 - explained * explained)
-    added = Covariance3(k * yh * yh, -k * xh * yh, k * xh * xh, 0.0, 0.0, 0.0)
-    shared = estimate.shared
-    shared = shared if shared is ZERO3 else shared.plus(added)
-    return Estimate(estimate.pose, estimate.covariance.plus(added), shared)
+    return _with_bend(estimate, arc_variance(hh) / (hh * hh) * (1.0 - explained * explained))
 
 
 def lever_change(dx: float, dy: float) -> Matrix3:

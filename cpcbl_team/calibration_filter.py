@@ -23,6 +23,7 @@ from types import MappingProxyType
 from typing import Final, NamedTuple
 
 from cpcbl_team.config import OdometryNoise
+from cpcbl_team.constraints import second_order_terms
 from cpcbl_team.estimate import ZERO3, Covariance3, Estimate, Row, Six
 from cpcbl_team.geometry import Pose2, new, wrap_angle
 from cpcbl_team.motion import covariance_after, distance_variance, turn_variance
@@ -73,27 +74,6 @@ class Frame(NamedTuple):
     stamp_ns: int
     odometry_from_robot: Pose2
     seen: list[SeenLandmark]
-
-
-class SecondOrder(NamedTuple):
-    """Mean and variance of what the linear form of a reading leaves out."""
-
-    mean: float
-    variance: float
-
-
-def second_order_terms(
-    xx: float, xy: float, yy: float, c: float, s: float
-) -> tuple[SecondOrder, SecondOrder]:
-    """Of b^2 / 2 and of -a b (m^2), where a position with the covariance ((xx, xy), (xy, yy)) (m^2)
-    errs by a towards an object in the direction (c, s), and by b to the left of it. Its range is
-    longer by the first divided by its distance, and its bearing larger by the second divided by the
-    square of that (Jazwinski 1970, section 9.3)."""
-    ahead = c * c * xx + 2.0 * c * s * xy + s * s * yy
-    left = s * s * xx - 2.0 * c * s * xy + c * c * yy
-    both = (c * c - s * s) * xy + c * s * (yy - xx)
-    of_range = SecondOrder(0.5 * left, 0.5 * left * left)
-    return of_range, SecondOrder(-both, ahead * left + both * both)
 
 
 class CalibrationFilter(NamedTuple):
@@ -312,15 +292,14 @@ class _Update:
             return
         kept = [*mean], [[*row] for row in self._rows]
         (xx, xy, *_), (_, yy, *_), *_ = self._rows
-        of_range, of_bearing = second_order_terms(xx, xy, yy, dx / distance, dy / distance)
+        of_range, of_bearing = second_order_terms(xx, xy, yy, dx, dy)
         chi_square, readings = 0.0, 0
         if range_m is not None:
             share = 1.0 - mean[SHARE]
             along = -share * dx / distance, -share * dy / distance
             row = (0, along[0]), (1, along[1]), (SHARE, -distance), (OFFSET, -1.0)
-            longer, k = of_range, share / distance
-            residual = range_m - (share * distance - mean[OFFSET] + k * longer.mean)
-            variance = range_variance * factor + k * k * longer.variance
+            residual = range_m - (share * (distance + of_range.mean) - mean[OFFSET])
+            variance = range_variance * factor + share * share * of_range.variance
             chi_square += self._update(row, residual, variance)
             readings += 1
         if bearing is not None:
@@ -328,9 +307,9 @@ class _Update:
             row_of_bearing = (0, dy / squared), (1, -dx / squared), (2, -1.0), (BEARING, 1.0)
             before, _ = kept
             expected = _atan2(dy, dx) - before[2] + before[BEARING]
-            residual = wrap_angle(bearing - expected) - of_bearing.mean / squared
+            residual = wrap_angle(bearing - expected) - of_bearing.mean
             residual -= sum([k * (mean[i] - before[i]) for i, k in row_of_bearing])
-            variance = bearing_variance * factor + of_bearing.variance / (squared * squared)
+            variance = bearing_variance * factor + of_bearing.variance
             chi_square += self._update(row_of_bearing, residual, variance)
             readings += 1
         if chi_square > GATE:

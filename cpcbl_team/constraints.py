@@ -14,12 +14,12 @@ functions return a `Constraint`.
 """
 
 import math
-from math import cos, sin
+from math import cos, sin, sqrt
 from typing import Final, NamedTuple
 
 from cpcbl_team.estimate import Covariance3, Row
 from cpcbl_team.gaussian import width_per_m
-from cpcbl_team.geometry import Pose2, wrap_angle
+from cpcbl_team.geometry import Pose2, new, wrap_angle
 
 _atan2: Final = math.atan2  # compiled code finds a constant faster than a global name
 NEAREST_M: Final = 1e-3  # nearer than this a direction means nothing
@@ -46,20 +46,40 @@ CURVED_SHARE: Final = 1e-3
 """Below this ratio of the position's variance to the squared distance, curves count as straight."""
 
 
-def curvature(prior: Covariance3, dx: float, dy: float) -> tuple[float, float]:
-    """The mean squares of what a linear range (m^2) and a linear bearing (rad^2) leave out.
+class SecondOrder(NamedTuple):
+    """Mean and variance of what the linear form of a reading leaves out."""
 
-    With the prior's errors a across and r along the line of sight, and the distance d, these are
-    a^2 / 2 d and a r / d^2: the second-order terms (Jazwinski 1970, section 9.3).
+    mean: float
+    variance: float
+
+    @property
+    def mean_square(self) -> float:
+        return self.mean * self.mean + self.variance
+
+
+def second_order_terms(
+    xx: float, xy: float, yy: float, dx: float, dy: float
+) -> tuple[SecondOrder, SecondOrder]:
+    """Of the range (m) and the bearing (rad) of an object (dx, dy) away, from a position with the
+    covariance ((xx, xy), (xy, yy)) (m^2).
+
+    With errors a across (to the left of) and r along the line of sight, and the distance d, these
+    are a^2 / 2 d and -a r / d^2: the second-order terms (Jazwinski 1970, section 9.3).
     """
-    xx, xy, yy, _, _, _ = prior
     squared = dx * dx + dy * dy
     along = (dx * dx * xx + 2.0 * dx * dy * xy + dy * dy * yy) / squared
     across = xx + yy - along
     common = (dx * dy * (yy - xx) + (dx * dx - dy * dy) * xy) / squared
-    of_range = 0.75 * across * across / squared
-    of_bearing = (along * across + 2.0 * common * common) / (squared * squared)
-    return of_range, of_bearing
+    of_range = 0.5 * across / sqrt(squared), 0.5 * across * across / squared
+    of_bearing = -common / squared, (along * across + common * common) / (squared * squared)
+    return new(SecondOrder, of_range), new(SecondOrder, of_bearing)
+
+
+def curvature(prior: Covariance3, dx: float, dy: float) -> tuple[float, float]:
+    """The mean squares of what a linear range (m^2) and a linear bearing (rad^2) leave out."""
+    xx, xy, yy, _, _, _ = prior
+    of_range, of_bearing = second_order_terms(xx, xy, yy, dx, dy)
+    return of_range.mean_square, of_bearing.mean_square
 
 
 def curved_variance(variance: float, predicted: float, curvature: float) -> float:

@@ -15,7 +15,6 @@ from cpcbl_team.calibration_filter import (
     CalibrationFilter,
     Frame,
     SeenLandmark,
-    second_order_terms,
 )
 from cpcbl_team.config import OdometryNoise
 from cpcbl_team.estimate import Estimate
@@ -176,20 +175,6 @@ def test_a_landmark_that_is_passed_closely_is_no_bias(names: str, bearing_deg: f
         bias, sigma = filters[0].error(BEARING)
         squares.append((bias / sigma) ** 2)
     assert np.mean(squares) < 1.8  # of 40 runs, the 99.9 % bound
-
-
-def test_second_order_terms_are_those_of_normal_errors() -> None:
-    rng, covariance = np.random.default_rng(1), np.array([[0.03, 0.01], [0.01, 0.02]])
-    errors = rng.multivariate_normal([0.0, 0.0], covariance, 200_000)
-    c, s = math.cos(0.7), math.sin(0.7)
-    ahead, left = errors @ [c, s], errors @ [-s, c]
-    of_range, of_bearing = second_order_terms(0.03, 0.01, 0.02, c, s)
-    for found, terms in ((of_range, 0.5 * left**2), (of_bearing, -ahead * left)):
-        assert found == pytest.approx((np.mean(terms), np.var(terms)), rel=0.03, abs=1e-5)
-    # The readings of an object 3 m away, where third orders are small
-    ranges, bearings = np.hypot(3.0 - ahead, left), np.arctan2(-left, 3.0 - ahead)
-    assert of_range[0] / 3.0 == pytest.approx(np.mean(ranges) - 3.0, abs=1e-3)
-    assert of_bearing[0] / 9.0 == pytest.approx(np.mean(bearings), abs=1e-3)
 
 
 def test_errors_are_as_certain_as_the_filter_says() -> None:

@@ -28,6 +28,7 @@ from cpcbl_team.constraints import (
     curvature,
     curved_variance,
     range_circle,
+    second_order_terms,
     wall_heading,
     wall_line,
 )
@@ -321,3 +322,21 @@ def test_a_range_repeated_beside_its_landmark_makes_no_certainty(
     off = np.array([state.estimate.pose.x, state.estimate.pose.y - 1.0])
     assert yy > (0.86 if state.memory.mixture else 0.9)  # one range says nothing along its circle
     assert off @ np.linalg.solve([[xx, xy], [xy, yy]], off) < 9.0
+
+
+def test_second_order_terms_are_those_of_normal_errors() -> None:
+    """Of an object 3 m away, where third orders are small."""
+    rng, covariance = np.random.default_rng(1), np.array([[0.03, 0.01], [0.01, 0.02]])
+    x, y = rng.multivariate_normal([0.0, 0.0], covariance, 200_000).T
+    dx, dy = 3.0 * math.cos(0.7), 3.0 * math.sin(0.7)
+    along, across = (x * dx + y * dy) / 3.0, (y * dx - x * dy) / 3.0
+    ranges, bearings = np.hypot(dx - x, dy - y), np.arctan2(dy - y, dx - x)
+    linear = 3.0 - along, 0.7 - across / 3.0
+    for found, left in zip(
+        second_order_terms(0.03, 0.01, 0.02, dx, dy),
+        (ranges - linear[0], bearings - linear[1]),
+        strict=True,
+    ):
+        assert found.mean == pytest.approx(np.mean(left), abs=2e-4)
+        assert found.variance == pytest.approx(np.var(left), rel=0.15)
+        assert found.mean_square == pytest.approx(np.mean(left**2), rel=0.15)
