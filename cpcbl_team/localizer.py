@@ -127,8 +127,7 @@ class Localizer:
         else:
             state, estimate = self._common.correct(state, gated.accepted)
         if prior is before:  # else it is about the best pose on its arc
-            accepted = gated.accepted
-            state, estimate = self._relinearization.after_frame(prior, state, accepted, estimate)
+            state, estimate = self._relinearization.after_frame(state, gated.accepted, estimate)
         state = self._with_frame(state, estimate, landmarks, gated, scope)
         state = self.screen.own.without_misleading(state)
         if self._stationary.is_active:
@@ -221,8 +220,8 @@ class Localizer:
     ) -> Estimate:
         """Step 4: the closest points of all constraints as one Gaussian. Step 5: its merge with the
         prior (equations 3 and 4). What has updated a mixture is in its estimate."""
-        prior, accepted, mixture = state.estimate, gated.accepted, state.memory.mixture
-        if accepted and mixture is not None and mixture.updated_ns == state.stamp_ns:
+        prior, accepted, mixture = state.estimate, gated.accepted, state.updated_mixture
+        if accepted and mixture is not None:
             prior = mixture.estimate
             accepted = [found for found in accepted if found.measurement.is_dependent]
             if not accepted:

@@ -116,24 +116,20 @@ class MixtureUpdate:
                 m.source for m in used if any(self._accepts(u.before, m) for u in heavy)
             )
             if len(accepted) == len(used):
-                found = merged(u.component(w) for u, w in zip(updated, weights, strict=True))
-                known = estimate_of(found, estimate)
-                return PoseMixture(found, known, state.stamp_ns), accepted
+                return _mixture_of(updated, weights, state), accepted
             used = [m for m in used if m.source in accepted]
         return mixture._replace(updated_ns=state.stamp_ns), frozenset()
 
     def after_position(self, mixture: PoseMixture, state: State, seen: Observation) -> PoseMixture:
         """The mixture of the state after its own position sensor, whose readings are linear.
         `seen`: about the estimate."""
-        before, updated = state.estimate, []
+        updated = []
         for component in mixture.components_now():
-            about = seen.shifted(*pose_difference(before.pose, component.pose))
+            about = seen.shifted(*pose_difference(state.estimate.pose, component.pose))
             readings = about.independent_scalars(about.noise())
             after = FilteredOffset(component.covariance).after(readings)
             updated.append(_Updated(component, after, _log_weight(component, after)))
-        weights = _weights(updated)
-        found = merged(u.component(w) for u, w in zip(updated, weights, strict=True))
-        return PoseMixture(found, estimate_of(found, before), state.stamp_ns)
+        return _mixture_of(updated, _weights(updated), state)
 
     def _split(
         self, components: Sequence[Component], measured: Sequence[Measurement]
@@ -200,6 +196,12 @@ def _weights(updated: Sequence[_Updated]) -> list[float]:
     """The weights of components after a frame, as shares of the largest one."""
     largest = max(u.log_weight for u in updated)
     return [math.exp(u.log_weight - largest) for u in updated]
+
+
+def _mixture_of(updated: Sequence[_Updated], weights: Sequence[float], state: State) -> PoseMixture:
+    """The mixture that has become of the state's."""
+    found = merged(u.component(w) for u, w in zip(updated, weights, strict=True))
+    return PoseMixture(found, estimate_of(found, state.estimate), state.stamp_ns)
 
 
 def _nonlinearity(

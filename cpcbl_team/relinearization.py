@@ -185,21 +185,21 @@ class Relinearization:
         return _about(state._replace(estimate=prior), arc, fit.offset), Linearization(arc, fit)
 
     def after_frame(
-        self, before: Estimate, state: State, accepted: Sequence[GatedObject], estimate: Estimate
+        self, state: State, accepted: Sequence[GatedObject], estimate: Estimate
     ) -> tuple[State, Estimate]:
         """The state and its next estimate after a frame whose objects were linearized at the pose
-        `before`; where they may leave a turn about one of them undetermined, with covariances about
-        its own pose. (A mixture needs none, and places that the robot has found have them.)"""
-        mixture, common = state.memory.mixture, state.common_errors
-        is_done = mixture is not None and mixture.updated_ns == state.stamp_ns
-        is_done |= common is not None and bool(common.found)
-        is_bent = before.covariance.hh > BENT_VARIANCE and self.is_due(state)
-        if is_done or not is_bent or not any(_leaves_a_turn(f.measurement) for f in accepted):
+        of the state; where they may leave a turn about one of them undetermined, with covariances
+        about its own pose. (A mixture needs none, and places that the robot has found have them.)
+        """
+        common, before = state.common_errors, state.estimate.pose
+        is_done = state.updated_mixture is not None or (common is not None and bool(common.found))
+        leaves_a_turn = any(_leaves_a_turn(f.measurement) for f in accepted)
+        if is_done or not leaves_a_turn or not self._is_bent(state):
             return state, estimate
         if common is not None:
-            dx, dy = estimate.pose.x - before.pose.x, estimate.pose.y - before.pose.y
+            dx, dy = estimate.pose.x - before.x, estimate.pose.y - before.y
             state = with_common_errors(state, common.with_pose_mapped(lever_change(dx, dy)))
-        return state, about_own_pose(estimate, before.pose)
+        return state, about_own_pose(estimate, before)
 
     def _measure(self, state: State, m: Measurement) -> Measure:
         """What an object says, with the errors of its place and of the camera as noise."""

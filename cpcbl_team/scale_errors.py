@@ -118,18 +118,18 @@ class Scale(NamedTuple):
         return known, _times(self.offset, share)
 
     def after_motion(
-        self, by_share: Row, dx: float, dy: float, at_least_zero: Covariance3 | None
+        self, by_share: Row, dx: float, dy: float, beside: Covariance3 | None
     ) -> tuple["Scale", Covariance3]:
         """After a motion by (dx, dy) in the field's frame, in which a share of one moves the pose
-        by `by_share`; and what that has added to the covariance of the pose. `at_least_zero`: see
-        `ScaleErrors.after_motion`."""
+        by `by_share`; and what that has added to the covariance of the pose. `beside`: of the pose,
+        if that may not be negative."""
         led = _led(self.covariance, dx, dy)
         # X g^T + g X^T, of which half of g B g^T is in each
         half = row_sum(led, by_share, 0.5 * self.considered)
-        if at_least_zero is None:
+        if beside is None:
             added = _symmetric(half, by_share)
         else:
-            added = _positive_part(half, by_share, at_least_zero)
+            added = _positive_part(half, by_share, beside)
         known = self._replace(
             offset=row_sum(_led(self.offset, dx, dy), by_share, self.error),
             covariance=row_sum(led, by_share, self.considered),
@@ -226,10 +226,10 @@ class ScaleErrors(NamedTuple):
         components of a mixture.)"""
         direction = before.pose.heading + 0.5 * turn
         dx, dy = distance * cos(direction), distance * sin(direction)
-        at_least_zero = before.covariance if takes_nothing else None
-        of_distance, added = self.distance.after_motion((dx, dy, 0.0), dx, dy, at_least_zero)
+        beside = before.covariance if takes_nothing else None
+        of_distance, added = self.distance.after_motion((dx, dy, 0.0), dx, dy, beside)
         by_turn = -0.5 * turn * dy, 0.5 * turn * dx, turn
-        of_turn, more = self.turn.after_motion(by_turn, dx, dy, at_least_zero)
+        of_turn, more = self.turn.after_motion(by_turn, dx, dy, beside)
         return ScaleErrors(of_distance, of_turn, self.estimate), added.plus(more)
 
     def pose_offset(self, now: Estimate, distance: float, turn: float) -> Row:

@@ -199,6 +199,12 @@ class State(NamedTuple):
         return kept if kept is not None and kept.is_of(self.estimate) else None
 
     @property
+    def updated_mixture(self) -> PoseMixture | None:
+        """The mixture that a frame of this time has updated."""
+        kept = self.memory.mixture
+        return kept if kept is not None and kept.updated_ns == self.stamp_ns else None
+
+    @property
     def reported(self) -> Estimate:
         """The estimate that others are told. Its covariance contains what may be wrong with the
         settings, too."""

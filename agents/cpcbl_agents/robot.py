@@ -5,7 +5,7 @@ is not imported: numpy for a log, OpenCV for a camera.
 """
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple, get_args
 
@@ -52,6 +52,11 @@ from cpcbl_transport.messages import Flow, Help, Message, Outgoing, Pose, Sensor
 
 NEVER_NS = 2**62
 _OUTGOING = frozenset(get_args(Outgoing))  # a look-up, for at every message one is due
+
+
+def _published(messages: Iterable[AgentMessage]) -> list[Outgoing]:
+    """Those of the agents' messages that the robot publishes."""
+    return [m for m in messages if type(m) in _OUTGOING]  # type: ignore[misc]
 
 
 class InputSnapshot(NamedTuple):
@@ -161,7 +166,7 @@ class Robot:
         estimates = [out for m in inputs for out in self.filter.handle(m, now_ns)]
         outgoing = [out for m in estimates for out in self.collaboration.handle(m, now_ns)]
         outgoing += [out for m in estimates for out in self.sensing.handle(m, now_ns)]
-        return [m for m in (*inputs, *outgoing) if type(m) in _OUTGOING]  # type: ignore[misc]
+        return _published([*inputs, *outgoing])
 
     def _handle_event(self, event: BusEvent, now_ns: int) -> list[Outgoing]:
         outgoing = self.collaboration.handle(event, now_ns)
@@ -175,7 +180,7 @@ class Robot:
                 # From now on what this robot knows may be in what its teammates publish
                 self._shared_ns = sent.stamp_ns
                 self.filter.handle(BeliefShared(sent.stamp_ns), now_ns)
-        return [m for m in outgoing if type(m) in _OUTGOING]  # type: ignore[misc]
+        return _published(outgoing)
 
     def forget_wrong_inputs(self, since_ns: int, now_ns: int) -> None:
         """Discards what the filter adapted while inputs were wrong: call it when the monitor finds
