@@ -60,6 +60,7 @@ def fix_for(
     sensor: SensorSettings,
     earlier: MeanPlace | None = None,
     common: CommonErrors | None = None,
+    turned_variance: float = 0.0,
 ) -> Fix | None:
     """The fix of the robot that `observer` saw; None if range or bearing is missing or unusable.
 
@@ -72,7 +73,8 @@ def fix_for(
     independent errors. At the readings themselves they would bias repeated fixes (Bordonaro et al.,
     Decorrelated unbiased converted measurement Kalman filter, IEEE Trans. AES, 2014), and short
     ranges would be sent more often. A first fix has only its own reading: see `unbiased_range_m`.
-    The constant errors of the observer's camera (`common`) are part of the observer's error.
+    The constant errors of the observer's camera (`common`) are part of the observer's error, or the
+    variance (rad^2) of the direction of its sensor, where that is not estimated.
     """
     range_m, bearing = sighting.range_m, sighting.bearing_rad
     if range_m is None or bearing is None or sighting_fault(sighting):
@@ -80,6 +82,7 @@ def fix_for(
     if range_m > sensor.max_range_for_range_m:  # only its bearing is good enough
         return None
     pose, covariance = estimate.pose, estimate.covariance
+    covariance = covariance._replace(hh=covariance.hh + turned_variance)
     place = None
     if earlier is not None and earlier.is_recent(stamp_ns):
         place = pose.inverse().transform(earlier.x, earlier.y)

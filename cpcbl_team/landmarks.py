@@ -108,6 +108,7 @@ class Landmarks:
         """`gates`: chi-square bounds of one and of two constraints. No landmark is plain if the
         rules, or errors that all sightings have in common, need more than `update` does."""
         rules, s = settings.localizer, settings.sensor
+        has_common_errors = has_common_errors or settings.turned_variance > 0.0
         plain = rules.variant != "weighted" and not (
             rules.paper_uncertainty or rules.learns or s.correlation_s > 0.0 or has_common_errors
         )

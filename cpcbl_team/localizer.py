@@ -210,7 +210,8 @@ class Localizer:
             m = measurement_of(sighting, now_ns, state.estimate.pose, self.field, *known)
             if m is not None:
                 m = m.corrected(bias, adaptation.ranges) if is_wrong else m
-                measured.append(m if factor == 1.0 else m.inflated(factor))
+                m = m if factor == 1.0 else m.inflated(factor)
+                measured += self._variant.parts(m)
         return state, measured, faults
 
     # Steps 4 and 5 ----------------------------------------------------------------------------

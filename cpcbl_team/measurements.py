@@ -101,15 +101,19 @@ class Measurement(msgspec.Struct, frozen=True, gc=False):
     """Whether it may change the heading alone; it has no range then."""
     is_estimated: bool = False
     """Whether the robot estimates the object's place with its own pose."""
+    turned_variance: float = 0.0
+    """Of the direction of the sensor (rad^2), which errs by the same in all bearings, where it is
+    not estimated."""
     sender: str = ""
     """The teammate whose belief the position is; empty: the map's, or the robot's own."""
 
     @property
     def is_dependent(self) -> bool:
-        """Whether its object's place has an error that the estimate may contain already, and that
-        is not estimated beside it."""
+        """Whether its object's place, or the direction of the sensor, has an error that the
+        estimate may contain already, and that is not estimated beside it."""
         is_uncertain = not self.is_estimated and any(self.position.covariance)
-        return bool(self.sender) or is_uncertain
+        is_turned = self.bearing is not None and self.turned_variance > 0.0
+        return bool(self.sender) or is_uncertain or is_turned
 
     @property
     def has_reading(self) -> bool:
@@ -118,6 +122,14 @@ class Measurement(msgspec.Struct, frozen=True, gc=False):
     @property
     def has_point_bearing(self) -> bool:
         return self.bearing is not None and self.wall is None
+
+    def independent_parts(self) -> "tuple[Measurement, ...]":
+        """The range and the bearing of an object of the map each for itself if only the bearing has
+        an error that the estimate may contain already."""
+        if self.turned_variance == 0.0 or self.sender or None in (self.range_m, self.bearing):
+            return (self,)
+        replace = msgspec.structs.replace
+        return replace(self, bearing=None), replace(self, range_m=None)
 
     def inflated(self, factor: float) -> "Measurement":
         """With both variances times this factor."""
@@ -189,7 +201,8 @@ def measurement_of(
     sigmas = sighting_sigmas(sighting, sensor, _expected_range(pose, position, wall))
     read = range_m, bearing, *sigmas
     is_estimated = common is not None and name in common.objects and not sender
-    about = on_map is None, *read, is_for_heading, is_estimated, sender
+    is_of_place = is_for_heading, is_estimated
+    about = on_map is None, *read, *is_of_place, settings.turned_variance, sender
     return Measurement(name, position, wall, *about)
 
 
@@ -320,7 +333,8 @@ def observation_of(prior: Estimate, m: Measurement, cs: list[Constraint]) -> Obs
     """The constraints of one object as an observation of the prior, at which they are linearized.
 
     The covariance of the object's place is compounded with the sensor's as the dependent part, as
-    for a teammate's place (docs/paper.md, row 39).
+    for a teammate's place (docs/paper.md, row 39). So is that of the sensor's direction, which acts
+    on bearings as the heading does.
     """
     rows, residuals = tuple(c.row for c in cs), tuple(c.residual for c in cs)
     sensor = [c.sigma * c.sigma for c in cs]
@@ -330,4 +344,7 @@ def observation_of(prior: Estimate, m: Measurement, cs: list[Constraint]) -> Obs
     first, last = place.along(ax, ay), place.along(bx, by)
     curves = left_out(prior, m, cs)  # the same in each repetition, as the teammate's error is
     dependent = Covariance2(first + curves[0], common, last + curves[-1])
+    if m.turned_variance > 0.0:
+        a, b, turned = cs[0].row[2], cs[-1].row[2], m.turned_variance
+        dependent += Covariance2(turned * a * a, turned * a * b, turned * b * b)
     return Observation(rows, residuals, Covariance2(sensor[0], 0.0, sensor[-1]), dependent)

@@ -24,7 +24,7 @@ from cpcbl_team.estimate import (
 from cpcbl_team.fusion import Observation, merge_naive, merge_split, with_all_shared
 from cpcbl_team.geometry import Pose2, wrap_angle
 from cpcbl_team.landmarks import LandmarkUpdate
-from cpcbl_team.measurements import GatedObject, combine
+from cpcbl_team.measurements import GatedObject, Measurement, combine
 from cpcbl_team.motion import NO_VARIANCE, MotionVariance, move
 from cpcbl_team.object_timers import has_passed
 from cpcbl_team.state import State
@@ -67,6 +67,10 @@ class JointVariant:
     def scope(self, scope: Scope) -> Scope:
         """What a merge may move, where measurements of this part of the pose are used."""
         return POSE
+
+    def parts(self, m: Measurement) -> tuple[Measurement, ...]:
+        """The parts of a measurement that are merged one by one."""
+        return (m,)
 
     def reduce(self, estimate: Estimate) -> Estimate:
         """The estimate in the form that the variant keeps."""
@@ -168,6 +172,10 @@ class CircularVariant(OvalVariant):
 
     def scope(self, scope: Scope) -> Scope:
         return scope
+
+    def parts(self, m: Measurement) -> tuple[Measurement, ...]:
+        """The range and the bearing by a sensor that may be turned, each for itself (see `observe`)."""
+        return m.independent_parts()
 
     def reduce(self, estimate: Estimate) -> Estimate:
         if self._uncoupled:

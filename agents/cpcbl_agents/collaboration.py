@@ -224,11 +224,12 @@ class CollaborationAgent:
     def _fixes(self, seen: agent.FrameEstimate, now_ns: int) -> list[Fix]:
         """The fixes of a frame that are worth sending."""
         offers, stamp_ns, sensor = [], seen.frame.stamp_ns, self._settings.sensor
+        errors = seen.common, self._settings.turned_variance
         for s in seen.frame.sightings:
             if s.id not in self._teammates and not self.guests.notice(s.id, stamp_ns):
                 continue
             earlier = self._places.get(s.id)
-            fix = fix_for(self._robot, stamp_ns, seen.estimate, s, sensor, earlier, seen.common)
+            fix = fix_for(self._robot, stamp_ns, seen.estimate, s, sensor, earlier, *errors)
             if fix is None:
                 continue
             fix = with_sensor_factor(fix, seen.sensor_factor)

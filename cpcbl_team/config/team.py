@@ -1,5 +1,6 @@
 """A team: its robots and what they share."""
 
+import math
 from typing import Annotated, Literal
 
 import msgspec
@@ -114,6 +115,15 @@ class LocalizationSettings(Table, frozen=True, kw_only=True):
     odometry: OdometrySettings = OdometrySettings()
     collaboration: CollaborationSettings = CollaborationSettings()
     start: Start | None = None
+
+    @property
+    def turned_variance(self) -> float:
+        """The variance (rad^2) of the sensor's direction where the filter cannot estimate it beside
+        the pose; 0 where it does, and where uncertainties are the paper's."""
+        rules = self.localizer
+        if rules.estimates_whole_pose or rules.paper_uncertainty or rules.variant == "weighted":
+            return 0.0
+        return math.radians(self.sensor.bearing_bias_sigma_deg) ** 2
 
 
 class RobotSettings(LocalizationSettings, frozen=True, kw_only=True):

@@ -8,6 +8,7 @@ from msgspec.structs import replace
 from support.core import (
     CORNERS,
     SECOND,
+    diagonal,
     displaced,
     frame,
     localizer,
@@ -28,11 +29,14 @@ from cpcbl_team.config import (
     OdometrySettings,
     SensorSettings,
     Start,
+    Variant,
 )
-from cpcbl_team.estimate import Estimate
+from cpcbl_team.estimate import Estimate, Scope
+from cpcbl_team.fixes import fix_for
 from cpcbl_team.geometry import Pose2, step, wrap_angle
 from cpcbl_team.inputs import Odometry, Sighting, Sightings
 from cpcbl_team.localizer import Localizer
+from cpcbl_team.measurements import constraints_of, observation_of
 from cpcbl_team.motion import motion_noise
 from cpcbl_team.second_filters import has_second_filters
 from cpcbl_team.state import State
@@ -42,6 +46,7 @@ ARC = 0.05, 0.04  # m and rad of each piece
 NOISE = OdometryNoise()
 START = Start(x_m=0.0, y_m=-1.2, heading_deg=0.0, sigma_m=0.02, heading_sigma_deg=1.0)
 EXACT = SensorSettings(range_share=0.03, bearing_sigma_deg=1.0, field_of_view_deg=60.0)
+HERE = Pose2(0.0, 0.0, 0.0)
 DOUBTED = replace(EXACT, bearing_bias_sigma_deg=3.0)
 
 
@@ -207,3 +212,52 @@ def test_many_frames_of_one_landmark_tell_nothing_of_a_turn_about_it(
         squares.append(covariance.position().mahalanobis_squared(x - pose.x, y - pose.y))
     assert sum(sigmas[1::2]) > 0.95 * sum(sigmas[::2])
     assert np.median(squares) < 2.5  # 1.4 is due
+
+
+@over_seeds(8, 40)
+def test_an_oval_that_does_not_estimate_the_turn_knows_that_it_is_in_every_bearing(
+    seeds: range,
+) -> None:
+    """The NEES is 1.8 over 30 seeds, and that of a robot that takes its mounting for exact 3.4."""
+    biases = np.radians(3.0) * np.random.default_rng(1).normal(size=40)
+
+    def mean_nees(sensor: SensorSettings) -> float:
+        robot = robot_of(sensor, LocalizerSettings(variant="oval"))
+        return float(np.mean([run(robot, biases[seed], seed)[2] for seed in seeds]))
+
+    assert mean_nees(DOUBTED) < 2.4
+    assert mean_nees(EXACT) > 2.8
+
+
+@pytest.mark.parametrize("variant", ["oval", "circular"])
+def test_the_turn_is_the_same_in_each_bearing_and_in_no_range(variant: Variant) -> None:
+    robot = robot_of(DOUBTED, LocalizerSettings(variant=variant))
+    state = robot.start(0)
+    _, _, _, measured = robot.measure(state, frame(state.estimate.pose, PIECE_NS))
+    assert measured
+    for m in measured:
+        found = [
+            c.is_bearing for c in constraints_of(HERE, m, Scope.POSE, robot.settings.localizer)
+        ]
+        assert found == ([False, True] if variant == "oval" else found[:1])
+        assert m.is_dependent == (True in found)
+        observation = observation_of(
+            state.estimate, m, constraints_of(HERE, m, Scope.POSE, robot.settings.localizer)
+        )
+        expected = [math.radians(3.0) ** 2 if is_bearing else 0.0 for is_bearing in found]
+        assert (observation.dependent.xx, observation.dependent.yy) == pytest.approx(
+            (expected[0], expected[-1]), abs=1e-3
+        )
+
+
+def test_a_fix_contains_what_the_observer_does_not_know_of_its_direction() -> None:
+    estimate = Estimate(HERE, diagonal(0.0, 0.0))
+    sighting = Sighting("mate", 4.0, 0.0)
+    exact, turned = (
+        fix_for("eye", 0, estimate, sighting, SensorSettings(), None, None, variance)
+        for variance in (0.0, math.radians(3.0) ** 2)
+    )
+    assert exact is not None
+    assert turned is not None
+    assert exact.observer_covariance == (0.0, 0.0, 0.0)
+    assert turned.observer_covariance[2] == pytest.approx((4.0 * math.radians(3.0)) ** 2, rel=0.01)

@@ -62,13 +62,13 @@ def test_a_position_sensor_alone_gives_these_variants_no_heading(variant: Varian
 
 
 @pytest.mark.parametrize("variant", ["oval", "circular", "weighted"])
-def test_these_variants_take_a_sensor_that_may_be_turned_for_exact(variant: Variant) -> None:
+def test_these_variants_never_learn_how_far_a_sensor_is_turned(variant: Variant) -> None:
     def robot(chosen: Variant, sigma_deg: float) -> RobotSettings:
         sensor = SensorSettings(bearing_bias_sigma_deg=sigma_deg)
         return RobotSettings(localizer=LocalizerSettings(variant=chosen), sensor=sensor)
 
     (line,) = warnings(team_of(MARKS, robot(variant, 2.0)))
-    assert line.startswith(f"robots.r1.sensor.bearing_bias_sigma_deg: {variant} takes")
+    assert line.startswith(f"robots.r1.sensor.bearing_bias_sigma_deg: {variant} never")
     right = robot("joint", 2.0), robot(variant, 0.0)
     assert [list(warnings(team_of(MARKS, r))) for r in right] == [[], []]
 

@@ -58,8 +58,8 @@ def warnings(team: Team) -> Iterator[str]:
         variant, sees_landmarks = robot.localizer.variant, robot.sensor.sees_landmarks
         if robot.sensor.bearing_bias_sigma_deg and not robot.localizer.estimates_whole_pose:
             yield (
-                f"robots.{name}.sensor.bearing_bias_sigma_deg: {variant} takes the direction of its"
-                " sensor for exact all the same, and is sure of a wrong pose; use variant joint"
+                f"robots.{name}.sensor.bearing_bias_sigma_deg: {variant} never learns the direction"
+                " of its sensor, and errs up to twice as much; use variant joint"
             )
         if robot.position_sensor is not None:
             if variant != "joint" and odometry.moves and not (sees_landmarks and objects):
