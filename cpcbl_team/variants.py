@@ -174,7 +174,7 @@ class CircularVariant(OvalVariant):
         return scope
 
     def parts(self, m: Measurement) -> tuple[Measurement, ...]:
-        """The range and the bearing by a sensor that may be turned, each for itself (see `observe`)."""
+        """The bearing by a sensor that may be turned apart from the range (see `observe`)."""
         return m.independent_parts()
 
     def reduce(self, estimate: Estimate) -> Estimate:

@@ -1,6 +1,5 @@
 """The processes of a run: THE table of them, who starts and stops them, and what each has used."""
 
-import ctypes
 import logging
 import os
 import re
@@ -9,7 +8,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Collection, Sequence
-from contextlib import AbstractContextManager, nullcontext, suppress
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import BinaryIO, NamedTuple, Protocol
 
@@ -28,7 +27,6 @@ FIRST_BACKOFF_S = 0.5
 LONGEST_BACKOFF_S = 8.0
 HEALTHY_S = 10.0
 PATIENCE_S = 3.0
-_M_ARENA_MAX = -8  # of malloc.h
 _PROC = Path("/proc")
 
 
@@ -269,11 +267,3 @@ def own_memory_mib(pid: int) -> float:
     rollup = (_PROC / str(pid) / "smaps_rollup").read_text()
     (kib,) = re.findall(r"^Anonymous: +(\d+) kB$", rollup, re.MULTILINE)
     return int(kib) / 1024
-
-
-def use_one_heap() -> None:
-    """Lets all threads of this process share one heap; to be called before they start. The GNU C
-    library has several by default, and memory that is free in one is not used for what another one
-    needs, so the process grows for hours. Other C libraries are left as they are."""
-    with suppress(OSError, AttributeError):
-        ctypes.CDLL(None).mallopt(_M_ARENA_MAX, 1)

@@ -28,12 +28,12 @@ from cpcbl_launch.reporting.recorder import Recorder, Report, variants_of
 from cpcbl_launch.reporting.recording import Recording
 from cpcbl_launch.run.admission import admission_control
 from cpcbl_launch.run.logged_team import is_calibrated_on
+from cpcbl_launch.run.one_heap import use_one_heap
 from cpcbl_launch.run.processes import (
     Processes,
     Supervisor,
     process_table,
     tasks,
-    use_one_heap,
 )
 from cpcbl_launch.run.router import team_router
 from cpcbl_launch.simulation.in_process import Progress, simulate

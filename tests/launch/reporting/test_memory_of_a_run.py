@@ -137,7 +137,7 @@ def test_problems_with_free_names_in_them_are_bounded() -> None:
 
 HEAPS = """
 import ctypes, sys, threading
-from cpcbl_launch.run.processes import use_one_heap
+from cpcbl_launch.run.one_heap import use_one_heap
 use_one_heap() if sys.argv[1] == "one" else None
 library, barrier = ctypes.CDLL(None), threading.Barrier(8)
 def allocate():
@@ -154,7 +154,7 @@ library.fclose(out)
 
 
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="a heap for each thread is glibc's")
-def test_all_threads_of_up_share_one_heap() -> None:
+def test_all_threads_of_up_and_of_a_robot_share_one_heap() -> None:
     heaps = {}
     for which in ("one", "usual"):
         words = [sys.executable, "-c", HEAPS, which]
