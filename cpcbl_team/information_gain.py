@@ -19,7 +19,7 @@ from cpcbl_team.estimate import SMALLEST_VARIANCE, Covariance3, Estimate
 from cpcbl_team.fusion import best_weight
 from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.inputs import Belief, Fix
-from cpcbl_team.measurements import extrapolated
+from cpcbl_team.measurements import extrapolated, position_by_belief
 from cpcbl_team.tiers import LOWEST_TIER, TIER_ZERO_SIGMA_M
 
 LOST_SIGMA_M = 2.0
@@ -28,6 +28,7 @@ LOST_HEADING_SIGMA_RAD = math.pi / math.sqrt(3.0)  # of a uniform distribution
 USUAL_HEADING_SIGMA_RAD = math.radians(10.0)  # assumed: a tier describes the position only
 HEADING_DRIFT_RAD_PER_SQRT_M = 0.1  # heading sigma that a teammate gains, a random walk
 HEADING_WAY_M = 1.0  # over which a heading's error is counted as one of the position
+MISLEADING_SIGMAS = 3.0  # by which a belief of before is wrong
 UNKNOWN_AGE_S = 60.0  # since the last help for a teammate, as long as there was none
 
 
@@ -244,3 +245,13 @@ def staleness(copy: Belief | None, now: Belief) -> float:
     off = math.sqrt(after.mahalanobis_squared(now.x_m - pose.x, now.y_m - pose.y))
     ratio = 0.5 * math.log(after.determinant() / before.determinant())
     return max(off, abs(ratio))
+
+
+def misleads(copy: Belief, now: Belief, settings: CollaborationSettings) -> bool:
+    """Whether receivers still use their `copy` at the time of `now`, and are wrong: a robot that
+    stood has driven off, or one that drove has turned, by more than they allow for."""
+    if now.stamp_ns - copy.stamp_ns > settings.max_age_s * 1e9:
+        return False
+    x, y, covariance = position_by_belief(copy, now.stamp_ns)
+    off_squared = _regularized(covariance).mahalanobis_squared(now.x_m - x, now.y_m - y)
+    return off_squared > MISLEADING_SIGMAS * MISLEADING_SIGMAS

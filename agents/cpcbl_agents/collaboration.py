@@ -332,7 +332,8 @@ class CollaborationAgent:
             tally.silent += 1
             return []
         age_s = (now.stamp_ns - self._belief_sent_ns) * 1e-9
-        if not self._affords(now_ns, _size(belief), age_s, urgent=False):
+        urgent = last is not None and gains.misleads(last, belief, rules)
+        if not self._affords(now_ns, _size(belief), age_s, urgent):
             tally.over_budget += 1
             return []
         self._last_belief = belief
@@ -380,13 +381,9 @@ class CollaborationAgent:
         return number
 
     def _record_sent(self, sent: agent.HelpSent, now_ns: int) -> None:
-        match message := sent.message:
-            case Fix():
-                topic, to = "fix", message.robot
-            case LandmarkBelief():
-                topic, to = "landmark", ""
-            case _:
-                topic, to = "belief", ""
+        message = sent.message
+        topic = {Fix: "fix", LandmarkBelief: "landmark"}.get(type(message), "belief")
+        to = message.robot if isinstance(message, Fix) else ""
         if sent.size:
             self.counters.of(topic, to).add(sent.size, message.stamp_ns)
             if isinstance(message, Belief):

@@ -115,6 +115,25 @@ def test_a_belief_beyond_the_budget_is_counted_and_sent_as_soon_as_the_budget_al
     assert stamps_s(alone.later(52.0))[0] <= 60.2
 
 
+def test_under_a_budget_a_robot_says_that_it_has_driven_off() -> None:
+    """Its teammates took it to stand where it had been, for 1.5 s; the interval of such a budget is
+    half a minute."""
+    alone = Alone(budget=BudgetSettings(bytes_per_s=4.0))
+    alone.tell(BeliefSubscribers(present=True))
+    alone.becomes(speed_m_s=0.0)
+    assert stamps_s(alone.later(0.4)) == [0.2]
+    alone.becomes(speed_m_s=0.5)
+    assert stamps_s(alone.later(10.0)) == [0.6]
+
+
+def test_a_belief_that_nobody_uses_any_more_is_not_urgent() -> None:
+    alone = Alone(budget=BudgetSettings(bytes_per_s=4.0))
+    alone.tell(BeliefSubscribers(present=True))
+    assert stamps_s(alone.later(2.0)) == [0.2]
+    alone.becomes(speed_m_s=0.5)
+    assert stamps_s(alone.later(10.0)) == []
+
+
 def test_no_beliefs_where_passive_help_is_switched_off_or_has_not_begun() -> None:
     for rules, then in (({"passive": False}, []), ({"after_s": 2.0}, [2.0])):
         alone = Alone(**rules)
