@@ -60,7 +60,6 @@ def fix_for(
     sensor: SensorSettings,
     earlier: MeanPlace | None = None,
     common: CommonErrors | None = None,
-    turned_variance: float = 0.0,
 ) -> Fix | None:
     """The fix of the robot that `observer` saw; None if range or bearing is missing or unusable.
 
@@ -73,8 +72,7 @@ def fix_for(
     independent errors. At the readings themselves they would bias repeated fixes (Bordonaro et al.,
     Decorrelated unbiased converted measurement Kalman filter, IEEE Trans. AES, 2014), and short
     ranges would be sent more often. A first fix has only its own reading: see `unbiased_range_m`.
-    The constant errors of the observer's camera (`common`) are part of the observer's error, or the
-    variance (rad^2) of the direction of its sensor, where that is not estimated.
+    The constant errors of the observer's camera (`common`) are part of the observer's error.
     """
     range_m, bearing = sighting.range_m, sighting.bearing_rad
     if range_m is None or bearing is None or sighting_fault(sighting):
@@ -82,7 +80,6 @@ def fix_for(
     if range_m > sensor.max_range_for_range_m:  # only its bearing is good enough
         return None
     pose, covariance = estimate.pose, estimate.covariance
-    covariance = covariance._replace(hh=covariance.hh + turned_variance)
     place = None
     if earlier is not None and earlier.is_recent(stamp_ns):
         place = pose.inverse().transform(earlier.x, earlier.y)
@@ -105,6 +102,13 @@ def fix_for(
         heading_sensor_variance=heading_sigma * heading_sigma,
         heading_observer_variance=turned,
     )
+
+
+def with_turned_sensor(observer: Estimate, variance: float) -> Estimate:
+    """The estimate of an observer for its fixes, if the direction of its sensor has this variance
+    (rad^2) and is not estimated."""
+    covariance = observer.covariance
+    return observer._replace(covariance=covariance._replace(hh=covariance.hh + variance))
 
 
 def _observer_part(covariance: Covariance3, dx: float, dy: float) -> Covariance2:

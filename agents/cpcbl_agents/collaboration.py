@@ -18,9 +18,9 @@ from cpcbl_agents.interests import Interests
 from cpcbl_agents.landmark_sharing import LandmarkSharing
 from cpcbl_agents.message_counters import MessageCounters
 from cpcbl_agents.teammate_frames import TeammateFrames
+from cpcbl_team import fixes
 from cpcbl_team import information_gain as gains
 from cpcbl_team.config import LocalizationSettings
-from cpcbl_team.fixes import MeanPlace, fix_for, mean_place, with_sensor_factor, without_heading
 from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.information_gain import FixMemory, HeadingMemory
 from cpcbl_team.inputs import Belief, Fix, HeadingBelief, LandmarkBelief
@@ -73,7 +73,7 @@ class CollaborationAgent:
         self._belief_ns = start_ns
         self._track_ns = -1
         self._latest_fixes: dict[str, Fix] = {}
-        self._places: dict[str, MeanPlace] = {}  # by all of its fixes
+        self._places: dict[str, fixes.MeanPlace] = {}  # by all of its fixes
         self._early_fixes: dict[str, Fix] = {}  # of robots whose tier is not known yet
         self._fix_memories: dict[str, tuple[int, FixMemory]] = {}
         self._needs: dict[str, gains.Need] = {}
@@ -224,16 +224,16 @@ class CollaborationAgent:
     def _fixes(self, seen: agent.FrameEstimate, now_ns: int) -> list[Fix]:
         """The fixes of a frame that are worth sending."""
         offers, stamp_ns, sensor = [], seen.frame.stamp_ns, self._settings.sensor
-        errors = seen.common, self._settings.turned_variance
+        observer = fixes.with_turned_sensor(seen.estimate, self._settings.turned_variance)
         for s in seen.frame.sightings:
             if s.id not in self._teammates and not self.guests.notice(s.id, stamp_ns):
                 continue
             earlier = self._places.get(s.id)
-            fix = fix_for(self._robot, stamp_ns, seen.estimate, s, sensor, earlier, *errors)
+            fix = fixes.fix_for(self._robot, stamp_ns, observer, s, sensor, earlier, seen.common)
             if fix is None:
                 continue
-            fix = with_sensor_factor(fix, seen.sensor_factor)
-            self._latest_fixes[s.id], self._places[s.id] = fix, mean_place(earlier, fix)
+            fix = fixes.with_sensor_factor(fix, seen.sensor_factor)
+            self._latest_fixes[s.id], self._places[s.id] = fix, fixes.mean_place(earlier, fix)
             if seen.lost or self.may_mislead:
                 continue
             if fix.robot in self.frames.tiers:
@@ -303,7 +303,7 @@ class CollaborationAgent:
                 gain, turned = gain + gained, HeadingMemory(*place, left)
                 heading_variance = variance - left
             else:
-                fix = without_heading(fix)
+                fix = fixes.without_heading(fix)
         age_s = (fix.stamp_ns - last_ns) * 1e-9
         removed = gains.removed_variance(prior, after, heading_variance)
         if tier != LOWEST_TIER:

@@ -32,7 +32,7 @@ from cpcbl_team.config import (
     Variant,
 )
 from cpcbl_team.estimate import Estimate, Scope
-from cpcbl_team.fixes import fix_for
+from cpcbl_team.fixes import fix_for, with_turned_sensor
 from cpcbl_team.geometry import Pose2, step, wrap_angle
 from cpcbl_team.inputs import Odometry, Sighting, Sightings
 from cpcbl_team.localizer import Localizer
@@ -251,10 +251,9 @@ def test_the_turn_is_the_same_in_each_bearing_and_in_no_range(variant: Variant) 
 
 
 def test_a_fix_contains_what_the_observer_does_not_know_of_its_direction() -> None:
-    estimate = Estimate(HERE, diagonal(0.0, 0.0))
-    sighting = Sighting("mate", 4.0, 0.0)
+    estimate, sighting = Estimate(HERE, diagonal(0.0, 0.0)), Sighting("mate", 4.0, 0.0)
     exact, turned = (
-        fix_for("eye", 0, estimate, sighting, SensorSettings(), None, None, variance)
+        fix_for("eye", 0, with_turned_sensor(estimate, variance), sighting, SensorSettings())
         for variance in (0.0, math.radians(3.0) ** 2)
     )
     assert exact is not None
