@@ -181,7 +181,7 @@ class Localizer:
             if common is not None:
                 evidence = [common.as_evidence(state, m) for m in measured]
             state = with_recovery(state, with_measurements(state, evidence)).counted(*faults)
-        return state, scope, landmarks, usable
+        return state, scope, landmarks, [part for m in usable for part in self._variant.parts(m)]
 
     def _measure_others(
         self, state: State, sightings: Iterable[Sighting], now_ns: int
@@ -210,8 +210,7 @@ class Localizer:
             m = measurement_of(sighting, now_ns, state.estimate.pose, self.field, *known)
             if m is not None:
                 m = m.corrected(bias, adaptation.ranges) if is_wrong else m
-                m = m if factor == 1.0 else m.inflated(factor)
-                measured += self._variant.parts(m)
+                measured.append(m if factor == 1.0 else m.inflated(factor))
         return state, measured, faults
 
     # Steps 4 and 5 ----------------------------------------------------------------------------

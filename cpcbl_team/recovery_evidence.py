@@ -27,8 +27,8 @@ def evidence_from_measurement(state: State, m: Measurement) -> Evidence:
     x, y, covariance = m.position
     sigma_m = math.sqrt(0.5 * (covariance.xx + covariance.yy))
     where = state.stamp_ns, state.odometry_from_robot, m.source, x, y, m.range_m, m.bearing
-    turned = math.hypot(m.bearing_sigma, math.sqrt(m.turned_variance))
-    return Evidence(*where, m.range_sigma, turned, sigma_m, bool(m.sender))
+    bearing_sigma = math.hypot(m.bearing_sigma, math.sqrt(m.turned_variance))
+    return Evidence(*where, m.range_sigma, bearing_sigma, sigma_m, bool(m.sender))
 
 
 def evidence_from_observation(state: State, observation: PoseObservation) -> Evidence:

@@ -119,9 +119,10 @@ class LocalizationSettings(Table, frozen=True, kw_only=True):
     @property
     def turned_variance(self) -> float:
         """The variance (rad^2) of the sensor's direction where the filter cannot estimate it beside
-        the pose; 0 where it does, and where uncertainties are the paper's."""
+        the pose; 0 where it does or learns it, and where uncertainties are the paper's."""
         rules = self.localizer
-        if rules.estimates_whole_pose or rules.paper_uncertainty or rules.variant == "weighted":
+        is_estimated, is_weighted = rules.estimates_whole_pose, rules.variant == "weighted"
+        if is_estimated or rules.learns or rules.paper_uncertainty or is_weighted:
             return 0.0
         return math.radians(self.sensor.bearing_bias_sigma_deg) ** 2
 

@@ -260,3 +260,16 @@ def test_a_fix_contains_what_the_observer_does_not_know_of_its_direction() -> No
     assert turned is not None
     assert exact.observer_covariance == (0.0, 0.0, 0.0)
     assert turned.observer_covariance[2] == pytest.approx((4.0 * math.radians(3.0)) ** 2, rel=0.01)
+
+
+@pytest.mark.parametrize("variant", ["oval", "circular"])
+def test_a_lost_robot_with_a_turned_sensor_remembers_ranges_and_bearings(variant: Variant) -> None:
+    robot = robot_of(DOUBTED, LocalizerSettings(variant=variant))
+    state = robot.start(0)
+    state = robot.cycle(state, frame(state.estimate.pose, PIECE_NS))
+    evidence = state.memory.recovery.evidence
+    assert len(evidence) == len(CORNERS.landmarks)
+    for piece in evidence:
+        assert piece.range_m is not None
+        assert piece.bearing_rad is not None
+        assert piece.bearing_sigma_rad > math.radians(3.0)
