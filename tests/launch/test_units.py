@@ -41,7 +41,7 @@ type = "a"
 start = { x_m = "1", y_m = 1e308, theta = 1.5708 }
 """
 FAULTS = [
-    ("robots.r1.start.y_m", "out of range"),
+    ("robots.r1.start.y_m", "at most 1e+06 (count from an origin near the field)"),
     ("nam", "'name'"),
     ("map.landmarks.door.x", "'x_m' (metres)"),
     ("transport.router", "'connect'"),

@@ -15,6 +15,7 @@ from cpcbl_team.inputs import NAME_PATTERN
 
 DEEPEST = 12  # tables in tables; the settings need half of it
 LARGEST, SMALLEST = 1e6, 1e-9  # of numbers that are not 0: messages carry no larger ones
+PLACE = re.compile(r"(\b[xy]_m|_m\[\d+\](\[\d+\])?)$")  # such as grid coordinates of a country
 LARGEST_AMOUNT = 2**40  # of bytes and messages
 NAMED = (
     "robots",
@@ -156,7 +157,8 @@ def _number_fault(key: str, value: float, smallest: float) -> str:
     if isinstance(value, float) and not math.isfinite(value):
         return "not a finite number; write a finite one"
     if abs(value) > largest:
-        return f"out of range; write a number of at most {largest:g}"
+        origin = " (count from an origin near the field)" if PLACE.search(key) else ""
+        return f"out of range; write a number of at most {largest:g}{origin}"
     if 0 < abs(value) < smallest:
         return f"{value:g} is too small; write 0, or at least {SMALLEST:g}"
     return ""
