@@ -22,7 +22,7 @@ KNOWN_RAD: Final = 0.15
 AGREEMENT: Final = 9.2  # the chi-square of a piece that agrees (99 % of two readings)
 LEAST_CONTRADICTIONS: Final = 3  # pieces of evidence: fewer may be outliers
 AGREEING_READINGS: Final = 2  # are needed for each object that contradicts
-UNDECIDED_NS: Final = 5_000_000_000  # a robot that was carried away takes so long to find its pose
+UNDECIDED_NS: Final = 5_000_000_000  # in so long a robot with ranges alone finds its pose
 UNUSED_NS: Final = 120_000_000_000  # for so long such an object is not used; then it is tried again
 
 
@@ -157,12 +157,13 @@ def kept_at_trusted_pose(
         return None  # nothing can be said of objects before the driver is mended
     elsewhere = None if found is None or agrees(known, found) else found
     if misplaced and not exchanged:
-        # Readings that determine no pose agree with others as well, and the map may fit at one
-        has_heading = any(e.bearing_rad is not None for e in comparison.agreeing)
-        is_determined = has_heading and sum(map(readings_of, comparison.agreeing)) >= UNKNOWNS
-        is_early = state.stamp_ns - memory.suspected_ns < UNDECIDED_NS
+        # Readings that determine no pose agree with others as well, and the map fits at one of them
+        is_determined = sum(map(readings_of, comparison.agreeing)) >= UNKNOWNS
         fits_elsewhere = elsewhere is not None and is_explained_by(elsewhere, evidence, place)
-        if not is_determined and (is_early or fits_elsewhere):
+        # Ranges agree by chance, whatever the heading is, until the robot has driven for a while
+        has_only_ranges = all(e.bearing_rad is None for e in comparison.agreeing)
+        is_early = state.stamp_ns - memory.suspected_ns < UNDECIDED_NS
+        if (has_only_ranges and is_early) or (fits_elsewhere and not is_determined):
             return None
     if not misplaced:
         latest = [e for e in evidence if e.stamp_ns >= state.stamp_ns - LATEST_NS]
