@@ -154,7 +154,7 @@ library.fclose(out)
 
 
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="a heap for each thread is glibc's")
-def test_all_threads_of_up_and_of_a_robot_share_one_heap() -> None:
+def test_all_threads_of_a_process_share_one_heap() -> None:
     heaps = {}
     for which in ("one", "usual"):
         words = [sys.executable, "-c", HEAPS, which]
