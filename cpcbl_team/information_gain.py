@@ -19,7 +19,7 @@ from cpcbl_team.estimate import SMALLEST_VARIANCE, Covariance3, Estimate
 from cpcbl_team.fusion import best_weight
 from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.inputs import Belief, Fix
-from cpcbl_team.measurements import extrapolated, position_by_belief
+from cpcbl_team.measurements import extrapolated, nearest_belief, position_by_belief
 from cpcbl_team.tiers import LOWEST_TIER, TIER_ZERO_SIGMA_M
 
 LOST_SIGMA_M = 2.0
@@ -250,7 +250,7 @@ def staleness(copy: Belief | None, now: Belief) -> float:
 def misleads(copy: Belief, now: Belief, settings: CollaborationSettings) -> bool:
     """Whether receivers still use their `copy` at the time of `now`, and are wrong: a robot that
     stood has driven off, or one that drove has turned, by more than they allow for."""
-    if now.stamp_ns - copy.stamp_ns > settings.max_age_s * 1e9:
+    if nearest_belief((copy,), now.stamp_ns, settings) is None:
         return False
     x, y, covariance = position_by_belief(copy, now.stamp_ns)
     off_squared = _regularized(covariance).mahalanobis_squared(now.x_m - x, now.y_m - y)

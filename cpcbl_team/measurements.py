@@ -199,11 +199,10 @@ def measurement_of(
     if gives == "range" or gives == "none":
         bearing = None
     sigmas = sighting_sigmas(sighting, sensor, _expected_range(pose, position, wall))
-    read = range_m, bearing, *sigmas
+    read = on_map is None, range_m, bearing, *sigmas
     is_estimated = common is not None and name in common.objects and not sender
-    is_of_place = is_for_heading, is_estimated
-    about = on_map is None, *read, *is_of_place, settings.turned_variance, sender
-    return Measurement(name, position, wall, *about)
+    about = is_for_heading, is_estimated, settings.turned_variance, sender
+    return Measurement(name, position, wall, *read, *about)
 
 
 def _expected_range(pose: Pose2, position: ObjectPosition, wall: config.Wall | None) -> float:

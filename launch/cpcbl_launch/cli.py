@@ -44,6 +44,9 @@ def main() -> None:
     # The matrices here are small: on them, threads of numpy wait for each other, and burn a core
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:
+        from cpcbl_launch.run.one_heap import use_one_heap
+
+        use_one_heap()
         _open_standard_files()
         _run()
     except KeyboardInterrupt:  # also while modules are imported, which takes most of the start

@@ -236,14 +236,11 @@ def test_the_turn_is_the_same_in_each_bearing_and_in_no_range(variant: Variant) 
     _, _, _, measured = robot.measure(state, frame(state.estimate.pose, PIECE_NS))
     assert measured
     for m in measured:
-        found = [
-            c.is_bearing for c in constraints_of(HERE, m, Scope.POSE, robot.settings.localizer)
-        ]
+        constraints = constraints_of(HERE, m, Scope.POSE, robot.settings.localizer)
+        found = [c.is_bearing for c in constraints]
         assert found == ([False, True] if variant == "oval" else found[:1])
         assert m.is_dependent == (True in found)
-        observation = observation_of(
-            state.estimate, m, constraints_of(HERE, m, Scope.POSE, robot.settings.localizer)
-        )
+        observation = observation_of(state.estimate, m, constraints)
         expected = [math.radians(3.0) ** 2 if is_bearing else 0.0 for is_bearing in found]
         assert (observation.dependent.xx, observation.dependent.yy) == pytest.approx(
             (expected[0], expected[-1]), abs=1e-3

@@ -226,11 +226,9 @@ def field(
 ) -> None:
     """Run the simulated field until SIGINT, SIGTERM or SIGHUP."""
     from cpcbl_agents.stop import StopSignal
-    from cpcbl_launch.run.one_heap import use_one_heap
     from cpcbl_launch.simulation.field_node import parse_sites, run_field
     from cpcbl_transport.zenoh_bus import ZenohBus, open_bus
 
-    use_one_heap()
     team = find_team(team_file)
     require_team_opencv(team, field=True)
     elsewhere = parse_sites(site or (), team)
@@ -273,7 +271,6 @@ def router(
 ) -> None:
     """Run the team's Zenoh router, on any machine, until SIGINT, SIGTERM or SIGHUP."""
     from cpcbl_agents.stop import StopSignal
-    from cpcbl_launch.run.one_heap import use_one_heap
     from cpcbl_launch.run.router import run_router, team_router
     from cpcbl_team.config import GuardSettings
     from cpcbl_transport.zenoh_bus import read_router_config
@@ -295,7 +292,6 @@ def router(
         typer.echo(f"// {title}\n// zenohd -c FILE, or cpcbl-team router --config FILE")
         typer.echo(json.dumps(settings, indent=2))
     else:
-        use_one_heap()
         guards = team.transport.guards if team else GuardSettings()
         run_router(settings, title, StopSignal(parent), guards, speed)
 

@@ -1,4 +1,4 @@
-"""One heap for all threads of a process, so that its memory stays flat."""
+"""One heap for all threads of a process, so that its memory stays flat. Every command uses it."""
 
 import ctypes
 from contextlib import suppress

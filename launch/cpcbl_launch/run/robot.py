@@ -10,7 +10,6 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from cpcbl_agents.clock import Clock
-from cpcbl_launch.run.one_heap import use_one_heap
 from cpcbl_launch.team.file import find_team
 from cpcbl_launch.team.requirements import require_endpoints, require_robots, require_team_opencv
 from cpcbl_team.config import Team
@@ -70,7 +69,6 @@ def run_robot_command(
     from cpcbl_agents.process import run_robot  # for other commands it costs 0.1 s
     from cpcbl_agents.stop import StopSignal
 
-    use_one_heap()
     team = find_team(arguments.team)
     require_robots(str(arguments.team), [arguments.name], team)
     require_team_opencv(team, [arguments.name])

@@ -28,7 +28,6 @@ from cpcbl_launch.reporting.recorder import Recorder, Report, variants_of
 from cpcbl_launch.reporting.recording import Recording
 from cpcbl_launch.run.admission import admission_control
 from cpcbl_launch.run.logged_team import is_calibrated_on
-from cpcbl_launch.run.one_heap import use_one_heap
 from cpcbl_launch.run.processes import (
     Processes,
     Supervisor,
@@ -190,7 +189,6 @@ def run_team(
     watch: Watch = nullcontext,
 ) -> Report:
     """Runs a team until its time is over or `stop()`. Raises BusError without a router."""
-    use_one_heap()
     run = run._replace(team=with_listen_endpoint(run.team))
     with ExitStack() as stack:
         folder = run.folder or Path(stack.enter_context(TemporaryDirectory(prefix="cpcbl-")))

@@ -59,7 +59,7 @@ def warnings(team: Team) -> Iterator[str]:
         if robot.sensor.bearing_bias_sigma_deg and not robot.localizer.estimates_whole_pose:
             yield (
                 f"robots.{name}.sensor.bearing_bias_sigma_deg: {variant} never learns the direction"
-                " of its sensor, and errs up to twice as much; use variant joint"
+                " of its sensor, and errs up to three times as much; use variant joint"
             )
         if robot.position_sensor is not None:
             if variant != "joint" and odometry.moves and not (sees_landmarks and objects):
