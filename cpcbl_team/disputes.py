@@ -7,7 +7,10 @@ source is. Its mean over some seconds would not do: the estimate may have been l
 than that, and reports from before then agreed with it.
 """
 
+import math
 from collections.abc import Collection
+from itertools import combinations
+from typing import Final
 
 from msgspec.structs import replace
 
@@ -20,14 +23,44 @@ from cpcbl_team.mean_offsets import (
     by_whole_noise,
     lead,
 )
-from cpcbl_team.sender_comparisons import SenderRecords, recent_senders
+from cpcbl_team.reported_tracks import ReportedPosition
+from cpcbl_team.sender_comparisons import SenderRecords, recent_senders, votes
 from cpcbl_team.sender_records import (
+    JUMP_SIGMAS,
     OWN_SENSORS,
+    SILENCE_NS,
     Denial,
     OffsetEvidence,
     SenderRecord,
     TeammateReport,
+    distances_between,
 )
+
+FADING_NS: Final = 500_000_000  # time constant of these sums: the estimate may move fast
+LEAST_UNITED: Final = 2  # teammates that contradict the estimate together
+
+
+def score_bound(senders: SenderRecords, limit: float) -> float:
+    """The score beyond which a sender is in dispute with the estimate: half of the limit if another
+    one contradicts the estimate, too, for two seldom do so by chance at the same time."""
+    against = dissenting({n: r for n, r in senders.items() if r.reason is None}, limit)
+    is_joint = sum(name != OWN_SENSORS for name in against) >= LEAST_UNITED
+    return 0.5 * limit if is_joint else limit
+
+
+def dissenting(recent: SenderRecords, limit: float) -> set[str]:
+    """The sources with a score of more than half the limit that say the robot is on the same side
+    of the estimate as the one with the largest score. Those of the other side contradict that one
+    even more."""
+    scores = {n: r.score for n, r in recent.items() if r.score > 0.5 * limit}
+    if not scores:
+        return set()
+    x, y = recent[max(scores, key=lambda n: (scores[n], n))].mean_offset
+    return {
+        n
+        for n in scores
+        if n == OWN_SENSORS or x * recent[n].mean_offset[0] + y * recent[n].mean_offset[1] >= 0.0
+    }
 
 
 def with_denial(
@@ -49,9 +82,12 @@ def with_denial(
     since_ns = senders[dissenter].dispute_since_ns
     before = record.denial
     is_same = before is not None and (before.of, before.since_ns) == (dissenter, since_ns)
-    total = before.chi_square if before is not None and is_same else 0.0
+    total = 0.0
+    if before is not None and is_same:
+        elapsed_ns = report.stamp_ns - before.stamp_ns
+        total = before.chi_square * math.exp(-max(elapsed_ns, 0) / FADING_NS)
     total += _denied_by(evidence, *senders[dissenter].mean_offset)
-    return replace(record, denial=Denial(dissenter, since_ns, total))
+    return replace(record, denial=Denial(dissenter, since_ns, total, report.stamp_ns))
 
 
 def _denied_by(report: OffsetEvidence, x: float, y: float) -> float:
@@ -64,15 +100,30 @@ def _denied_by(report: OffsetEvidence, x: float, y: float) -> float:
 def supporters_of_estimate(
     recent: SenderRecords, dissenters: Collection[str], bound: float, began_ns: int
 ) -> set[str]:
-    """The sources that agreed with the estimate since a dispute began, and do not agree as well
-    with what the senders say whose score is beyond the `bound`."""
+    """The sources that the estimate followed since a dispute began, because they never contradicted
+    it clearly, and that do not agree as well with what the senders say whose score is beyond the
+    `bound`. One that differs from the estimate by less leads it on."""
     parties = {n: r for n, r in recent.items() if r.score > bound}
     return {
         name
         for name, r in recent.items()
         if name not in dissenters
-        and r.last_agreement_ns > max(began_ns, r.dispute_since_ns)
+        and r.last_report_ns > began_ns > r.last_failure_ns
         and _denies(r, parties)
+    }
+
+
+def supporters_of_dissent(recent: SenderRecords, bound: float) -> set[str]:
+    """The sources that are clearly nearer to what a sender says whose score is beyond the `bound`
+    than to the estimate, also where they are too vague to contradict it themselves."""
+    parties = {n: r for n, r in recent.items() if r.score > bound}
+    return {
+        name
+        for name, r in recent.items()
+        if (denial := r.denial) is not None
+        and (party := parties.get(denial.of)) is not None
+        and denial.since_ns == party.dispute_since_ns
+        and denial.chi_square < -USUAL
     }
 
 
@@ -90,3 +141,32 @@ def _denies(record: SenderRecord, parties: SenderRecords) -> bool:
     estimate = MeanOffset(0.0, 0.0, NOTHING, stamp_ns=mean.stamp_ns)
     claims = (r.mean_offset for r in parties.values())
     return all(lead(estimate, estimate._replace(x=x, y=y), mean) > USUAL for x, y in claims)
+
+
+# A robot that is elsewhere ------------------------------------------------------------------------
+
+
+def united_majority(senders: SenderRecords, now_ns: int) -> tuple[str, ...]:
+    """The teammates that contradict the estimate since anybody last agreed with it, if they are
+    several, most of those that were heard lately, and agree with each other; else none."""
+    heard = {
+        n: r
+        for n, r in senders.items()
+        if n != OWN_SENSORS and not r.reason and now_ns - r.last_report_ns <= SILENCE_NS
+    }
+    agreed_ns = max((r.last_agreement_ns for r in senders.values()), default=now_ns)
+    against = {n: r for n, r in heard.items() if r.last_failure_ns > agreed_ns}
+    number = votes(heard, against, heard)
+    if number < LEAST_UNITED or 2 * number <= votes(heard, heard, heard):
+        return ()
+    positions = [r.position for r in against.values() if r.position is not None]
+    since = [p for p in positions if p.stamp_ns > agreed_ns]
+    is_united = all(_agree(a, b) for a, b in combinations(since, 2))
+    return tuple(sorted(against)) if is_united else ()
+
+
+def _agree(one: ReportedPosition, other: ReportedPosition) -> bool:
+    """Whether two positions are as far from each other as the robot drove between them. (Where it
+    is elsewhere than it believes, so is its heading, and offsets from its estimate change.)"""
+    reported, driven, sigma = distances_between(one, other)
+    return abs(reported - driven) <= JUMP_SIGMAS * sigma

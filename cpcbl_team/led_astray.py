@@ -195,7 +195,7 @@ class OwnPoses:
         own, adaptation = state.memory.teammates.own, state.memory.calibration.adaptation
         if own is None or state.lost or own.adaptation != adaptation:
             return None
-        if own.is_old(state.stamp_ns) or own.gaps != _gaps(state) or self.is_guessed(state):
+        if own.is_old(state.stamp_ns) or own.gaps != gaps_of(state) or self.is_guessed(state):
             return None
         own = self._by_odometry(own if with_hypotheses else own.alone, state)
         if not own.is_known:
@@ -209,7 +209,7 @@ class OwnPoses:
     def _new_own_pose(self, state: State) -> OwnPose:
         """The pose by own sensors where it begins: the estimate."""
         known = state.memory.calibration
-        estimate, gaps = mark_shared(state.estimate), _gaps(state)
+        estimate, gaps = mark_shared(state.estimate), gaps_of(state)
         return OwnPose(state.stamp_ns, estimate, known.adaptation, gaps, known.common)
 
 
@@ -250,6 +250,6 @@ def _nis(own: OwnPose, state: State, observation: Observation) -> float:
     return 2.0 * nis / len(observation.rows)
 
 
-def _gaps(state: State) -> int:
+def gaps_of(state: State) -> int:
     """How often odometry was missing."""
     return state.memory.events.get("odometry_gap", 0)

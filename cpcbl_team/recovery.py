@@ -11,6 +11,7 @@ from typing import Final
 from cpcbl_team.calibration_filter import DETERMINED
 from cpcbl_team.config import Field, LocalizationSettings
 from cpcbl_team.contradictions import contradicts, kept_at_trusted_pose
+from cpcbl_team.disputes import united_majority
 from cpcbl_team.estimate import Estimate
 from cpcbl_team.inflation import inflate_covariance, inflate_to
 from cpcbl_team.initial_pose import estimate_of
@@ -47,7 +48,7 @@ from cpcbl_team.state import (
     with_common_errors,
     with_recovery,
 )
-from cpcbl_team.trust import forget_reports, reset_scores, united_majority
+from cpcbl_team.trust import forget_reports, reset_scores
 from cpcbl_team.trusted_pose import (
     agrees,
     expected_pose,

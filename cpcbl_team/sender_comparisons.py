@@ -29,7 +29,15 @@ from cpcbl_team.mean_offsets import (
     contradicts,
     disagreement,
 )
-from cpcbl_team.sender_records import NEVER_NS, OWN_SENSORS, SILENCE_NS, Rival, SenderRecord
+from cpcbl_team.reported_tracks import is_refuted
+from cpcbl_team.sender_records import (
+    NEVER_NS,
+    OWN_SENSORS,
+    SILENCE_NS,
+    Rival,
+    SenderRecord,
+    with_loud_track,
+)
 
 RECENT_NS: Final = 3_000_000_000  # a sender takes part in disputes for so long after a report
 LEAST_CONFIRMED: Final = 20  # reports of a guest with which others agreed, until it is proven
@@ -196,6 +204,17 @@ def rival_of(record: SenderRecord, name: str, other: SenderRecord) -> Rival:
     """The other sender as a rival of this one, with the distance between what both said last."""
     (x, y), (ox, oy) = (r.mean_offset if r.score else (0.0, 0.0) for r in (record, other))
     return Rival(name, ox - x, oy - y)
+
+
+def with_track_result(senders: SenderRecords, name: str) -> SenderRecord:
+    """The record of a sender after its track was compared with those of the others. Guests are no
+    witnesses, for anybody may come as several of them."""
+    record = senders[name]
+    track = record.track
+    if track is None or not track.is_loud or track.last.stamp_ns != record.last_report_ns:
+        return record
+    others = [r.track for n, r in senders.items() if n != name and r.track and not r.is_guest]
+    return with_loud_track(record, is_refuted(track, others))
 
 
 def contest_m(senders: SenderRecords, name: str) -> float:

@@ -20,7 +20,6 @@ from msgspec.structs import replace
 
 from cpcbl_team.estimate import Covariance3, Sums
 from cpcbl_team.gaussian import Covariance2
-from cpcbl_team.geometry import Pose2
 from cpcbl_team.mean_headings import COURSE_VARIANCE, NO_TURNS, FadingTurns
 from cpcbl_team.mean_offsets import (
     FAST_NS,
@@ -31,6 +30,7 @@ from cpcbl_team.mean_offsets import (
     MeanOffset,
     by_whole_noise,
 )
+from cpcbl_team.reported_tracks import ReportedPosition, ReportedTrack, with_reported
 
 SILENCE_NS: Final = 10_000_000_000  # earlier reports count no longer after this silence
 USUAL_NIS = 6.0  # 95 % quantile of the chi-square distribution of two degrees of freedom
@@ -46,7 +46,9 @@ LONGEST_COMPARISON_NS = 5_000_000_000  # after this time without a jump any dist
 FADING_S = 10.0  # time constant with which conflicts with odometry fade
 CLEAR_CONFLICTS = 0.5  # so many conflicts speak against a sender if one was just before a dispute,
 REPEATED_CONFLICTS = 1.5  # and so many at any time: an old one alone may be chance
+REFUTED_CONFLICTS = 3.0  # of a sender whose track contradicts itself
 JUST_BEFORE_NS: Final = 2_000_000_000
+RELAPSE_NS: Final = 60_000_000_000  # a quarantine so soon after readmission is a relapse
 NEVER_NS: Final = -(2**62)
 OWN_SENSORS = ""  # stands for the robot's own sensors among the senders; no robot has this name
 NO_EVIDENCE: Final[Mapping[str, float]] = MappingProxyType({})
@@ -69,19 +71,6 @@ BY_COMPARISON: Final = (
     QuarantineReason.OVERCONFIDENT,
     QuarantineReason.OUTVOTED,
 )
-
-
-class ReportedPosition(NamedTuple):
-    """Where a sender reported this robot, in the field's frame, and its odometry at that time."""
-
-    stamp_ns: int
-    x: float
-    y: float
-    variance: float  # m^2, of the major axis
-    odometry_from_robot: Pose2
-    turn_rad: float = 0.0  # the heading of the estimate minus that of odometry
-    odometry_m2_per_m: float = 0.0  # variance of a distance by odometry per metre, by its settings,
-    odometry_share: float = 0.0  # and the sigma of its scale
 
 
 class OffsetEvidence(NamedTuple):
@@ -137,6 +126,7 @@ class Denial(NamedTuple):
     of: str
     since_ns: int
     chi_square: float
+    stamp_ns: int = 0  # of the last report in that sum
 
 
 class SenderRecord(msgspec.Struct, frozen=True, gc=False):
@@ -150,6 +140,7 @@ class SenderRecord(msgspec.Struct, frozen=True, gc=False):
     """Exponential mean of the offsets of its reports that disagree, m."""
     offset_variance: float = 0.0  # exponential variance of these offsets, m^2
     position: ReportedPosition | None = None  # with which the next position is compared in test 2
+    track: ReportedTrack | None = None  # of all of them
     comparisons: float = 0.0  # number of comparisons with odometry, fading
     odometry_conflicts: float = 0.0  # number of them that contradicted odometry, fading
     missed_motion: bool = False
@@ -162,6 +153,8 @@ class SenderRecord(msgspec.Struct, frozen=True, gc=False):
     reason: QuarantineReason | None = None  # why it is in quarantine; None if it is not
     since_ns: int = 0  # when the quarantine began, or ended
     quarantines: int = 0
+    readmitted_ns: int = NEVER_NS  # when the last one ended because its reports were right again
+    relapses: int = 0  # how many in a row began soon after that
     offsets: tuple[FadingOffsets, ...] = (FadingOffsets(), FadingOffsets())  # fast and slow
     means: tuple[MeanOffset | None, ...] = (None, None)  # of these, after the last report
     bias_variance: float = 0.0
@@ -266,6 +259,7 @@ def _with_position(record: SenderRecord, now: ReportedPosition | None) -> Sender
     then = record.position
     if now is None:
         return record
+    record = replace(record, track=with_reported(record.track, now))
     if then is None or now.stamp_ns - then.stamp_ns > SILENCE_NS:
         return replace(record, position=now)
     if now.stamp_ns <= then.stamp_ns:
@@ -302,8 +296,8 @@ def distances_between(then: ReportedPosition, now: ReportedPosition) -> tuple[fl
     difference (m): wheels that are known to be noisy contradict nobody by that noise."""
     displacement = then.odometry_from_robot.inverse() @ now.odometry_from_robot
     driven = math.hypot(displacement.x, displacement.y)
-    slip, scale = SLIP_SHARE * driven + SLIP_M, now.odometry_share * driven
-    of_odometry = slip * slip + now.odometry_m2_per_m * driven + scale * scale
+    slip, scale = SLIP_SHARE * driven + SLIP_M, now.errors.share * driven
+    of_odometry = slip * slip + now.errors.m2_per_m * driven + scale * scale
     sigma = math.sqrt(then.variance + now.variance + of_odometry)
     return math.hypot(now.x - then.x, now.y - then.y), driven, sigma
 
@@ -321,13 +315,36 @@ def _with_course(
     return courses.with_report(now.stamp_ns, offset, variance)
 
 
+def with_loud_track(record: SenderRecord, is_refuted: bool) -> SenderRecord:
+    """The record of a sender whose reports contradict each other, or odometry: with as many
+    conflicts as a quarantine needs, if others show that odometry is right (`is_refuted`). One in
+    quarantine stays there."""
+    now_ns = record.last_report_ns
+    if record.reason is not None:
+        return replace(record, last_failure_ns=now_ns, agreements=0)
+    if not is_refuted:
+        return record
+    conflicts = max(record.odometry_conflicts, REFUTED_CONFLICTS)
+    comparisons = max(record.comparisons, conflicts)
+    record = replace(record, odometry_conflicts=conflicts, comparisons=comparisons)
+    record = replace(record, last_conflict_ns=now_ns, last_failure_ns=now_ns)
+    return replace(record, missed_motion=False, confirmations=0, agreements=0)
+
+
 # Quarantine ---------------------------------------------------------------------------------------
 
 
 def quarantined(record: SenderRecord, reason: QuarantineReason, now_ns: int) -> SenderRecord:
     """The record of a sender whose quarantine begins."""
+    is_relapse = now_ns - record.readmitted_ns <= RELAPSE_NS
+    relapses = record.relapses + 1 if is_relapse else 0
     record = replace(record, agreements=0, confirmations=0, quarantines=record.quarantines + 1)
-    return replace(record, reason=reason, since_ns=now_ns, rivals=())
+    return replace(record, reason=reason, since_ns=now_ns, rivals=(), relapses=relapses)
+
+
+def readmitted(record: SenderRecord, now_ns: int) -> SenderRecord:
+    """The record of a sender whose quarantine ends because its reports are right again."""
+    return replace(released(record, now_ns), readmitted_ns=now_ns)
 
 
 def released(record: SenderRecord, now_ns: int) -> SenderRecord:

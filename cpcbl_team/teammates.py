@@ -22,7 +22,7 @@ from cpcbl_team.hypotheses import at_compromise
 from cpcbl_team.inflation import inflate_by_offset, inflate_to
 from cpcbl_team.inputs import Belief, Input, LandmarkBelief, Position, Sightings
 from cpcbl_team.landmarks import LandmarkUpdate
-from cpcbl_team.led_astray import OwnPoses
+from cpcbl_team.led_astray import OwnPoses, gaps_of
 from cpcbl_team.mean_offsets import (
     HEADING_VARIANCE,
     NOTHING,
@@ -39,6 +39,7 @@ from cpcbl_team.measurements import (
     observation_of,
 )
 from cpcbl_team.recovery_evidence import without_senders
+from cpcbl_team.reported_tracks import OdometryErrors, ReportedPosition
 from cpcbl_team.sender_comparisons import (
     LEAST_CONFIRMED,
     RECENT_NS,
@@ -50,7 +51,6 @@ from cpcbl_team.sender_records import (
     NEVER_NS,
     OWN_SENSORS,
     OffsetEvidence,
-    ReportedPosition,
     TeammateReport,
 )
 from cpcbl_team.state import State, with_memory, with_senders, with_teammates
@@ -82,7 +82,7 @@ class TeammateScreen:
         self._gates = gates
         o = settings.odometry
         self.own = OwnPoses(o, common, gates[1])
-        self._odometry_errors = o.distance_sigma_m_per_sqrt_m**2, o.distance_scale_sigma
+        self._odometry_errors = OdometryErrors.of(o)
         self.is_active = self._rules.enabled and is_probabilistic
 
     def has_recent_reports(self, state: State, now_ns: int) -> bool:
@@ -255,11 +255,12 @@ class TeammateScreen:
         odometry_from_robot = state.odometry_from_robot
         turn_rad = state.estimate.pose.heading - odometry_from_robot.heading
         where = now, observation.x, observation.y, variance, odometry_from_robot, turn_rad
+        known = gaps_of(state), self._odometry_errors
         report = TeammateReport(
             now,
             None if is_lost or is_guessed else nis,
             (ex, ey),
-            None if is_guessed else ReportedPosition(*where, *self._odometry_errors),
+            None if is_guessed else ReportedPosition(*where, *known),
             _evidence_at(state, position.information(position.noise(0.0)), position.dependent),
             self._is_guest(observation.sender),
             of_heading,

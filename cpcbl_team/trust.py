@@ -16,14 +16,19 @@ readmitted after its reports were right for some time (docs/trust.md).
 
 import math
 from collections.abc import Collection
-from itertools import combinations
 from typing import Final, NamedTuple
 
 from msgspec.structs import replace
 
 from cpcbl_team.compromises import compromise
 from cpcbl_team.config import TrustSettings
-from cpcbl_team.disputes import supporters_of_estimate, with_denial
+from cpcbl_team.disputes import (
+    dissenting,
+    score_bound,
+    supporters_of_dissent,
+    supporters_of_estimate,
+    with_denial,
+)
 from cpcbl_team.mean_comparisons import EVIDENCE_ON_MOST, Comparison
 from cpcbl_team.mean_offsets import FAST, disagreement
 from cpcbl_team.overturned_quarantines import outvoted_majority, witnesses_of_contest
@@ -42,23 +47,22 @@ from cpcbl_team.sender_comparisons import (
     votes,
     voting_means,
     with_comparison,
+    with_track_result,
     wrong_turn,
 )
 from cpcbl_team.sender_records import (
     BY_COMPARISON,
     CONTRADICTING_NIS,
-    JUMP_SIGMAS,
     MOST_NIS,
     OWN_SENSORS,
     SILENCE_NS,
     OffsetEvidence,
     QuarantineReason,
-    ReportedPosition,
     SenderRecord,
     TeammateReport,
-    distances_between,
     is_in_conflict,
     quarantined,
+    readmitted,
     reason_of,
     released,
     with_evidence,
@@ -71,8 +75,8 @@ TIE_NS = 1_500_000_000  # a dispute between equally many is decided for the esti
 MOST_CONFLICTS = 2.5  # with more a sender is quarantined: at the third within a short time
 LEAST_AGREEMENTS = 10  # reports that must agree with the estimate before a sender is readmitted,
 LEAST_CONFIRMATIONS = 2  # or distances that must agree with odometry
+MOST_RELAPSES: Final = 3  # each doubles the time until a sender is readmitted, up to so many
 PERSISTENCE_NS: Final = 500_000_000  # a mean that is wrong for so long is no chance
-LEAST_UNITED: Final = 2  # teammates that agree with each other against the estimate
 
 
 class TrustDecision(NamedTuple):
@@ -143,6 +147,7 @@ def _decide(
     """The decision that the tests of one report lead to."""
     now = report.stamp_ns
     record = with_report(senders.get(name, SenderRecord()), report, rules.limit)
+    record = with_track_result({**senders, name: record}, name)
     record = with_denial(record, senders, name, report)
     senders = {**senders, name: record}
     comparison = compare(senders, name, now)
@@ -192,14 +197,15 @@ def _decide_dispute(
     """Decides who is wrong if a sender has contradicted the estimate for long enough. A source
     supports the estimate only if it agreed with it after the dispute began. If none does, no sender
     is blamed: the robot detects by its innovations that it is lost."""
-    is_dispute = any(r.score > rules.limit for r in senders.values())
+    bound = score_bound(senders, rules.limit)
+    is_dispute = any(r.score > bound for r in senders.values())
     recent = senders_with_a_say(senders, name, now_ns) if is_dispute else {}
-    disputes_ns = [r.dispute_since_ns for r in recent.values() if r.score > rules.limit]
+    disputes_ns = [r.dispute_since_ns for r in recent.values() if r.score > bound]
     if not disputes_ns:
         return TrustDecision(senders, True)
     began_ns = min(disputes_ns)
-    dissenters = {n for n, r in recent.items() if r.score > 0.5 * rules.limit}
-    supporters = supporters_of_estimate(recent, dissenters, rules.limit, began_ns)
+    dissenters = dissenting(recent, rules.limit) | supporters_of_dissent(recent, bound)
+    supporters = supporters_of_estimate(recent, dissenters, bound, began_ns)
     if not supporters:
         return TrustDecision(senders, True)
     rivals = {r.name for n in dissenters for r in open_rivals(senders, n)}
@@ -271,7 +277,7 @@ def _quarantine_supporters(
 ) -> TrustDecision:
     """The decision against the senders that a wrong estimate followed."""
     names = frozenset(supporters - {OWN_SENSORS})
-    errors_m = [math.hypot(*senders[n].mean_offset) for n in dissenters]
+    errors_m = [math.hypot(*senders[n].mean_offset) for n in dissenters if senders[n].score]
     changed = {n: quarantined(senders[n], QuarantineReason.OUTVOTED, now_ns) for n in names}
     changed = {**senders, **changed, **{n: replace(senders[n], score=0.0) for n in dissenters}}
     return TrustDecision(changed, name not in names, "outvoted", names, max(errors_m))
@@ -311,45 +317,20 @@ def _assess_quarantined(
     if record.last_failure_ns == now and contradicts:
         record = replace(record, reason=reason_of(record))
         senders = {**senders, name: record}
-    readmit_ns = int(rules.readmit_s * 1e9)
+    readmit_ns = int(rules.readmit_s * 1e9) << min(record.relapses, MOST_RELAPSES)
     others = recent_senders(senders, now, name)
     is_confirmed = any(r.last_agreement_ns >= now - RECENT_NS for _, r in others)
     if comparison is not None and (comparison.is_wrong or comparison.is_contested):
         record = replace(record, last_failure_ns=now, agreements=0)
         senders = {**senders, name: record}
-    agrees = record.agreements >= LEAST_AGREEMENTS and now - record.last_failure_ns >= readmit_ns
+    wrong_ns = max(record.last_failure_ns, record.since_ns)
+    agrees = record.agreements >= LEAST_AGREEMENTS and now - wrong_ns >= readmit_ns
     is_alone = all(now - r.last_report_ns > SILENCE_NS for n, r in senders.items() if n != name)
     has_confirmations = record.confirmations >= LEAST_CONFIRMATIONS
     is_consistent = has_confirmations and now - record.last_conflict_ns >= readmit_ns
     if not ((agrees and is_confirmed) or (is_alone and is_consistent)):
         return TrustDecision(senders, False)
-    return TrustDecision({**senders, name: released(record, now)}, True, "readmitted")
-
-
-def united_majority(senders: SenderRecords, now_ns: int) -> tuple[str, ...]:
-    """The teammates that contradict the estimate since anybody last agreed with it, if they are
-    several, most of those that were heard lately, and agree with each other; else none."""
-    heard = {
-        n: r
-        for n, r in senders.items()
-        if n != OWN_SENSORS and not r.reason and now_ns - r.last_report_ns <= SILENCE_NS
-    }
-    agreed_ns = max((r.last_agreement_ns for r in senders.values()), default=now_ns)
-    against = {n: r for n, r in heard.items() if r.last_failure_ns > agreed_ns}
-    number = votes(heard, against, heard)
-    if number < LEAST_UNITED or 2 * number <= votes(heard, heard, heard):
-        return ()
-    positions = [r.position for r in against.values() if r.position is not None]
-    since = [p for p in positions if p.stamp_ns > agreed_ns]
-    is_united = all(_agree(a, b) for a, b in combinations(since, 2))
-    return tuple(sorted(against)) if is_united else ()
-
-
-def _agree(one: ReportedPosition, other: ReportedPosition) -> bool:
-    """Whether two positions are as far from each other as the robot drove between them. (Where it
-    is elsewhere than it believes, so is its heading, and offsets from its estimate change.)"""
-    reported, driven, sigma = distances_between(one, other)
-    return abs(reported - driven) <= JUMP_SIGMAS * sigma
+    return TrustDecision({**senders, name: readmitted(record, now)}, True, "readmitted")
 
 
 def reset_scores(senders: SenderRecords) -> SenderRecords:

@@ -7,7 +7,14 @@ from msgspec.structs import replace
 from support.core import SECOND
 from support.trust import AGREES
 
-from cpcbl_team.disputes import supporters_of_estimate, with_denial
+from cpcbl_team.disputes import (
+    FADING_NS,
+    dissenting,
+    score_bound,
+    supporters_of_dissent,
+    supporters_of_estimate,
+    with_denial,
+)
 from cpcbl_team.estimate import Covariance3
 from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.mean_offsets import USUAL, MeanOffset
@@ -110,3 +117,50 @@ def test_nobody_denies_itself_or_one_in_quarantine() -> None:
     assert denial(senders, "dissenter", said) is None
     senders["dissenter"] = replace(DISSENTER, reason=QuarantineReason.BIASED)
     assert denial(senders, "other", said) is None
+
+
+# Both sides ---------------------------------------------------------------------------------------
+
+
+def test_one_that_leads_the_estimate_within_its_gate_supports_it() -> None:
+    """An echo that amplified the error of the estimate by 0.3 never agreed with it, and never
+    contradicted it clearly, so no dispute was decided while it led a blind robot on at 1.4 m/s."""
+    leads = replace(source(0.0, 0.0), last_agreement_ns=0, dispute_since_ns=NOW_NS, score=3.0)
+    assert supports(leads)
+    assert not supports(replace(leads, last_failure_ns=NOW_NS))
+    assert not supports(replace(leads, last_report_ns=BEGAN_NS - 1))
+
+
+def test_one_that_is_too_vague_to_contradict_supports_what_it_is_nearer_to() -> None:
+    """Two correct observers said the same of the estimate, but only one was precise enough to
+    contradict it alone. It stood against one liar, and came into quarantine."""
+    vague = source(CLAIM_M, CLAIM_M, CLAIM_M)
+    recent = {"dissenter": DISSENTER, "other": vague}
+    assert supporters_of_dissent(recent, LIMIT) == {"other"}
+    assert supporters_of_dissent({**recent, "other": source(0.0, 0.0)}, LIMIT) == set()
+    assert supporters_of_dissent({**recent, "other": source(CLAIM_M, sigma_m=0.5)}, LIMIT) == set()
+    over = replace(DISSENTER, score=LIMIT - 1.0)
+    assert supporters_of_dissent({**recent, "dissenter": over}, LIMIT) == set()
+
+
+def test_what_was_said_before_the_estimate_moved_fades() -> None:
+    senders = {"dissenter": DISSENTER, "other": source(0.0, 0.0)}
+    before = senders["other"].denial
+    later = report(0.0, 10.0)._replace(stamp_ns=NOW_NS + FADING_NS)
+    after = denial(senders, "other", later)
+    assert before is not None
+    assert after is not None
+    assert after.chi_square == pytest.approx(before.chi_square / math.e, rel=1e-3)
+
+
+def test_dissenters_on_both_sides_of_the_estimate_are_not_one_side() -> None:
+    """A liar that amplifies by 2.5 contradicts the estimate in one direction, a correct observer in
+    the other. Counted as one side they outvoted the other correct observer."""
+    liar = replace(DISSENTER, score=LIMIT + 2.0, mean_offset=(-CLAIM_M, 0.01))
+    senders = {"honest": DISSENTER, "liar": liar}
+    assert dissenting(senders, LIMIT) == {"liar"}
+    assert score_bound(senders, LIMIT) == LIMIT
+    both = {"honest": DISSENTER, "other": replace(DISSENTER, score=0.6 * LIMIT)}
+    assert dissenting(both, LIMIT) == {"honest", "other"}
+    assert score_bound(both, LIMIT) == 0.5 * LIMIT
+    assert dissenting({"honest": replace(DISSENTER, score=0.4 * LIMIT)}, LIMIT) == set()

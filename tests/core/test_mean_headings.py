@@ -10,8 +10,9 @@ from cpcbl_team.estimate import Covariance3
 from cpcbl_team.geometry import Pose2
 from cpcbl_team.mean_headings import NO_TURNS, FadingTurns, MeanTurn, contradicting
 from cpcbl_team.mean_offsets import FadingOffsets
+from cpcbl_team.reported_tracks import ReportedPosition
 from cpcbl_team.sender_comparisons import SenderRecords
-from cpcbl_team.sender_records import NEVER_NS, ReportedPosition, TeammateReport
+from cpcbl_team.sender_records import NEVER_NS, TeammateReport
 from cpcbl_team.trust import assess
 
 SECOND = 1_000_000_000

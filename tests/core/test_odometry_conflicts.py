@@ -12,8 +12,8 @@ from support.core import (
 from support.trust import AGREES, CONTRADICTS, MS, RULES, Receiver
 
 from cpcbl_team.geometry import Pose2
+from cpcbl_team.reported_tracks import OdometryErrors, ReportedPosition
 from cpcbl_team.sender_records import (
-    ReportedPosition,
     SenderRecord,
     TeammateReport,
     distances_between,
@@ -95,14 +95,16 @@ def test_noise_of_the_wheels_that_the_settings_state_is_no_fault_of_a_sender(
         receiver.now_ns = i * 100 * MS
         read += 0.05 + dice.gauss(0.0, 0.25 * math.sqrt(0.05))
         wheels, x = Pose2(read, 0.0, 0.0), 0.05 * i + dice.gauss(0.0, 0.06)
-        place = ReportedPosition(receiver.now_ns, x, 0.0, 0.06**2, wheels, 0.0, stated)
+        place = ReportedPosition(
+            receiver.now_ns, x, 0.0, 0.06**2, wheels, errors=OdometryErrors(stated)
+        )
         receiver.report("honest", TeammateReport(receiver.now_ns, None, (0.0, 0.0), place))
     assert bool(receiver.events) is not bool(stated)
 
 
 def test_a_scale_of_the_wheels_that_may_be_off_is_no_fault_of_a_sender() -> None:
     then, now = (ReportedPosition(i, 5.0 * i, 0.0, 4e-4, Pose2(6.0 * i, 0.0, 0.0)) for i in (0, 1))
-    *_, sigma = distances_between(then, now._replace(odometry_share=0.2))
+    *_, sigma = distances_between(then, now._replace(errors=OdometryErrors(share=0.2)))
     *_, exact = distances_between(then, now)
     assert sigma**2 - exact**2 == pytest.approx((0.2 * 6.0) ** 2)
 

@@ -8,11 +8,12 @@ from msgspec.structs import replace
 from support.core import LOOP_START, SECOND, driven, frame, localizer, loop, position_error
 
 from cpcbl_team.config import OdometrySettings, Start
+from cpcbl_team.disputes import united_majority
 from cpcbl_team.geometry import Pose2
 from cpcbl_team.inputs import Fix
-from cpcbl_team.sender_records import ReportedPosition, Rival, SenderRecord
+from cpcbl_team.reported_tracks import ReportedPosition
+from cpcbl_team.sender_records import Rival, SenderRecord
 from cpcbl_team.state import State, with_senders, with_teammates
-from cpcbl_team.trust import united_majority
 
 AWAY = Pose2(1.5, 1.0, 2.0)  # where the field is, in the robot's belief: it was carried
 CARRIED_S, EVERY_S = 10.0, 1.5

@@ -10,6 +10,7 @@ from support.core import (
 )
 from support.trust import AGREES, CONTRADICTS, MS, RULES, Receiver
 
+from cpcbl_team.disputes import united_majority
 from cpcbl_team.estimate import Covariance3
 from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.mean_offsets import MeanOffset
@@ -23,7 +24,7 @@ from cpcbl_team.sender_records import (
     SenderRecord,
     TeammateReport,
 )
-from cpcbl_team.trust import assess, trust_statuses, united_majority
+from cpcbl_team.trust import assess, trust_statuses
 
 
 @pytest.fixture
@@ -164,6 +165,7 @@ def test_a_sender_that_began_to_dissent_does_not_support_the_estimate() -> None:
             now_ns - 1,
             last_agreement_ns=9 * SECOND,
             dispute_since_ns=now_ns - 1,
+            last_failure_ns=now_ns - 1,
             odometry_conflicts=1.0,
         ),
     }

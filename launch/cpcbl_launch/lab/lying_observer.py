@@ -26,6 +26,7 @@ SIGMA_M = 0.01  # per axis, of its sightings and of its own position together
 HEADING_SIGMA = math.radians(1.0)
 TIER = 0
 GATE_SIGMAS = 2.0  # no fix is farther from the victim's pose than this
+AMPLIFIED_BY: Final = 1.3  # the error of the victim, by an echo that amplifies it
 
 
 class LyingObserver:
@@ -35,8 +36,8 @@ class LyingObserver:
         self, bus: Bus, name: str, victims: Sequence[str], fault: Fault, seed: int, sends: str
     ) -> None:
         """`sends`: "fixes", "headings" (fixes with a heading), "gated" (fixes within the gate of
-        the victim's own pose), "echoes" (the victim's own pose in place of the truth) or
-        "beliefs"."""
+        the victim's own pose), "echoes" (the victim's own pose in place of the truth),
+        "amplified" (that pose, with 1.3 times its error) or "beliefs"."""
         self.next_ns = 0
         self.waiting = False
         self._name, self._sends = name, sends
@@ -51,7 +52,7 @@ class LyingObserver:
         self._fixes = {robot: bus.publisher(k, topics.FIX.qos) for robot, k in keys.items()}
         self._subscriber = Subscriber(bus, Truths, self._on_message)
         self._poses: dict[str, Pose] = {}
-        if sends in ("gated", "echoes"):
+        if sends in ("gated", "echoes", "amplified"):
             self._pose_subscriber = Subscriber(bus, Pose, self._on_pose)
 
     def leave(self) -> None:
@@ -87,9 +88,11 @@ class LyingObserver:
 
     def _fix_of(self, truth: Truth, stamp_ns: int) -> Fix:
         seen: Truth | Pose = truth
-        if self._sends == "echoes" and stamp_ns >= self._from_ns:
+        if self._sends in ("echoes", "amplified") and stamp_ns >= self._from_ns:
             seen = self._poses.get(truth.robot, truth)
-        x, y = (v + self._random.gauss(0.0, SIGMA_M) for v in (seen.x_m, seen.y_m))
+        k = AMPLIFIED_BY if self._sends == "amplified" else 1.0
+        said = (truth.x_m + k * (seen.x_m - truth.x_m), truth.y_m + k * (seen.y_m - truth.y_m))
+        x, y = (v + self._random.gauss(0.0, SIGMA_M) for v in said)
         half = 0.5 * SIGMA_M**2
         fix = Fix(truth.robot, self._name, stamp_ns, x, y, (half, 0.0, half), (half, 0.0, half))
         if self._sends != "headings":

@@ -124,6 +124,18 @@ def test_an_echo_leads_no_blind_robot_astray_beside_two_correct_observers(seed: 
 
 
 @pytest.mark.thorough
+@pytest.mark.parametrize("seed", [2, 5])
+def test_an_echo_that_amplifies_leads_no_blind_robot_astray(seed: int) -> None:
+    """It pulled the estimate away as fast as its own error grew: up to 27.9 times the error, with a
+    correct observer in quarantine in six of eight seeds."""
+    attack = replace(EVERY["amplified echo", "scout"], end_s=40.0)
+    _, row = rows_of([attack], [seed])
+    assert row.worst_ratio < 1.8
+    assert row.false_quarantines == 0
+    assert row.least_inside_3_sigma > 0.93
+
+
+@pytest.mark.thorough
 def test_the_runs_to_compare_with_have_no_liar(short: dict[tuple[str, str], AttackRow]) -> None:
     for key in (("", "scout"), ("", "navigator")):
         assert short[key].worst_ratio == 1.0

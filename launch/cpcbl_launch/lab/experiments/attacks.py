@@ -32,6 +32,7 @@ HONEST = ("north", "south")
 ONE, TWO, GUEST = ("west",), ("west", "east"), ("ghost",)
 GUESTS = tuple(f"ghost{i}" for i in range(1, 6))
 DRIFT = "drift:0.01,0.0,0.01"  # 1 cm/s, and it states 1 cm
+CERTAIN = "drift:0.0,0.0,0.01"  # it adds nothing, and states 1 cm
 ONE_AXIS = "one-axis:0.02,0.005,0.25"  # 2 cm/s in x, where it states 5 mm, and 25 cm in y
 LEAST_INSIDE = 0.95  # of the victim's samples within 3 sigma, where nobody can find the liars
 OWN_EYES_RATIO, BLIND_RATIO = 1.3, 1.5
@@ -97,6 +98,7 @@ def attacks() -> tuple[Attack, ...]:
         Attack(name="headings", lie="heading:1.0,1.0", sends="headings"),
         Attack(name="one axis", lie=ONE_AXIS, sends="gated"),
         Attack(name="echo", lie=DRIFT, sends="echoes"),
+        Attack(name="amplified echo", lie=CERTAIN, sends="amplified"),
     )
     cases = [replace(kind, liars=ONE) for kind in kinds]
     cases += [replace(kind, liars=TWO, **NAVIGATOR) for kind in kinds]
