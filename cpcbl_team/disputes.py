@@ -108,7 +108,7 @@ def supporters_of_estimate(
         name
         for name, r in recent.items()
         if name not in dissenters
-        and r.last_report_ns > began_ns > r.last_failure_ns
+        and r.last_accepted_ns > began_ns > r.last_failure_ns
         and _denies(r, parties)
     }
 

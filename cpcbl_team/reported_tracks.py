@@ -72,6 +72,7 @@ class ReportedTrack(NamedTuple):
     first: ReportedPosition | None  # while the heading is not known yet
     last: ReportedPosition
     estimate: Estimate
+    since_ns: int = NEVER_NS  # when its heading became known
     score: float = 0.0  # by how much the NIS of its reports exceeded what is between
     loud_ns: int = NEVER_NS  # when the score was last above `QUIET`
     half_ns: int = NEVER_NS  # and when it was last at most half of the limit
@@ -88,13 +89,15 @@ def with_reported(track: ReportedTrack | None, now: ReportedPosition) -> Reporte
     """The track with one more report. It begins anew after a gap of the odometry, which is bridged
     by a guess."""
     if track is None or track.last.gaps != now.gaps or _elapsed_ns(track, now) > LONGEST_NS:
-        return ReportedTrack(now, now, UNKNOWN, half_ns=now.stamp_ns)
+        return ReportedTrack(now, now, UNKNOWN, now.stamp_ns, half_ns=now.stamp_ns)
     if _elapsed_ns(track, now) <= 0:
         return track
     if track.first is not None:
         start = _start_of_track(track.first, now)
         first = track.first if start is None else None
-        return track._replace(first=first, last=now, estimate=start or UNKNOWN)
+        return track._replace(
+            first=first, last=now, estimate=start or UNKNOWN, since_ns=now.stamp_ns
+        )
     motion = _motion(track, now)
     before = after_motion(track.estimate, motion)
     ex, ey, r = now.x - before.pose.x, now.y - before.pose.y, now.variance
@@ -110,6 +113,7 @@ def with_reported(track: ReportedTrack | None, now: ReportedPosition) -> Reporte
         None,
         now,
         merge(before, evidence),
+        track.since_ns,
         score,
         now.stamp_ns if score > QUIET else track.loud_ns,
         now.stamp_ns if score <= 0.5 * LIMIT else track.half_ns,
@@ -120,14 +124,16 @@ def with_reported(track: ReportedTrack | None, now: ReportedPosition) -> Reporte
 
 def is_refuted(track: ReportedTrack, others: Iterable[ReportedTrack]) -> bool:
     """Whether the reports of one sender contradict each other while odometry is right. It may be
-    wrong, and then others contradict it, too: those that would have noticed so large an error, and
-    reported while this one became loud. No more of them may have been loud than were quiet."""
+    wrong, or the robot was carried away, and then others contradict it, too: those that would have
+    noticed so large an error, and reported before and while this one became loud. No more of them
+    may have been loud than were quiet."""
     if not track.is_loud:
         return False
     now_ns, quiet, loud = track.last.stamp_ns, 0, 1
     for other in others:
         stamp_ns = other.last.stamp_ns
-        if now_ns - stamp_ns > WITNESS_NS or other.variance > track.size_m2:
+        is_new = other.first is not None or other.since_ns > track.half_ns - WITNESS_NS
+        if is_new or now_ns - stamp_ns > WITNESS_NS or other.variance > track.size_m2:
             continue
         if other.loud_ns >= track.half_ns - WITNESS_NS:
             loud += 1
@@ -145,10 +151,8 @@ def _start_of_track(first: ReportedPosition, now: ReportedPosition) -> Estimate 
     first one gives. None while that is too short. The heading of the estimate may be led astray."""
     way = first.odometry_from_robot.inverse() @ now.odometry_from_robot
     x, y = now.x - first.x, now.y - first.y
-    squared, noise = (
-        min(way.x * way.x + way.y * way.y, x * x + y * y),
-        first.variance + now.variance,
-    )
+    squared = min(way.x * way.x + way.y * way.y, x * x + y * y)
+    noise = first.variance + now.variance
     if noise >= COURSE_SIGMA * COURSE_SIGMA * squared:
         return None
     heading = wrap_angle(math.atan2(y, x) - math.atan2(way.y, way.x) + way.heading)

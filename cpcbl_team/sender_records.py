@@ -134,6 +134,7 @@ class SenderRecord(msgspec.Struct, frozen=True, gc=False):
 
     last_report_ns: int = NEVER_NS
     last_agreement_ns: int = NEVER_NS
+    last_accepted_ns: int = NEVER_NS  # when a report was last so near that the estimate followed it
     dispute_since_ns: int = NEVER_NS  # when its score last left zero
     score: float = 0.0  # the sum of test 1: NIS beyond the usual
     mean_offset: tuple[float, float] = (0.0, 0.0)
@@ -232,7 +233,8 @@ def _with_nis(
     if score and not record.score and not record.reason:
         offset = report.offset or (0.0, 0.0)
         record = replace(record, dispute_since_ns=now, mean_offset=offset, offset_variance=0.0)
-    record = replace(record, score=score)
+    accepted_ns = now if nis <= CONTRADICTING_NIS else record.last_accepted_ns
+    record = replace(record, score=score, last_accepted_ns=accepted_ns)
     if nis <= USUAL_NIS:
         return replace(record, last_agreement_ns=now, agreements=record.agreements + 1)
     if report.offset is not None:

@@ -55,7 +55,7 @@ def source(*offsets: float, sigma_m: float = 0.07, mean_m: float | None = None) 
     mean = None
     if mean_m is not None:
         mean = MeanOffset(mean_m, 0.0, Covariance2(1e-4, 0.0, 1e-4), stamp_ns=NOW_NS)
-    record = SenderRecord(NOW_NS, last_agreement_ns=NOW_NS, means=(mean, mean))
+    record = SenderRecord(NOW_NS, last_accepted_ns=NOW_NS, means=(mean, mean))
     for x in offsets:
         senders = {"dissenter": DISSENTER, "other": record}
         record = with_denial(record, senders, "other", report(x, sigma_m))
@@ -125,10 +125,10 @@ def test_nobody_denies_itself_or_one_in_quarantine() -> None:
 def test_one_that_leads_the_estimate_within_its_gate_supports_it() -> None:
     """An echo that amplified the error of the estimate by 0.3 never agreed with it, and never
     contradicted it clearly, so no dispute was decided while it led a blind robot on at 1.4 m/s."""
-    leads = replace(source(0.0, 0.0), last_agreement_ns=0, dispute_since_ns=NOW_NS, score=3.0)
+    leads = replace(source(0.0, 0.0), dispute_since_ns=NOW_NS, score=3.0)
     assert supports(leads)
     assert not supports(replace(leads, last_failure_ns=NOW_NS))
-    assert not supports(replace(leads, last_report_ns=BEGAN_NS - 1))
+    assert not supports(replace(leads, last_accepted_ns=BEGAN_NS - 1))
 
 
 def test_one_that_is_too_vague_to_contradict_supports_what_it_is_nearer_to() -> None:

@@ -225,7 +225,7 @@ def test_a_dispute_is_decided_where_own_readings_speak_clearly_against_the_sende
 
 
 def agreeing(record: SenderRecord) -> SenderRecord:
-    return replace(record, last_agreement_ns=NOW_NS)
+    return replace(record, last_accepted_ns=NOW_NS)
 
 
 def test_one_in_quarantine_is_tested_by_what_it_reports() -> None:

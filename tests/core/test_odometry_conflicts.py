@@ -149,7 +149,7 @@ def test_a_sender_in_conflict_with_odometry_does_not_count_against_one_that_is_n
     senders = {
         "conflicting": replace(dissenter, odometry_conflicts=1.0, last_conflict_ns=8 * SECOND),
         "other": dissenter,
-        "honest": SenderRecord(last_report_ns=now_ns - 1, last_agreement_ns=now_ns - 1),
+        "honest": SenderRecord(last_report_ns=now_ns - 1, last_accepted_ns=now_ns - 1),
     }
     decision = assess(
         senders, "other", TeammateReport(now_ns, CONTRADICTS, (1.0, 0.0)), now_ns - 1, RULES
@@ -184,7 +184,7 @@ def test_one_conflict_long_before_a_dispute_takes_no_vote(
             dissenter, odometry_conflicts=conflicts, last_conflict_ns=round(conflict_s * SECOND)
         ),
         "south": dissenter,
-        "liar": SenderRecord(last_report_ns=now_ns - 1, last_agreement_ns=now_ns - 1),
+        "liar": SenderRecord(last_report_ns=now_ns - 1, last_accepted_ns=now_ns - 1),
     }
     report = TeammateReport(now_ns, CONTRADICTS, (1.0, 0.0))
     assert assess(senders, "south", report, now_ns - 1, RULES).quarantined == outvoted

@@ -86,8 +86,8 @@ def loudest(reports: Iterator[ReportedPosition]) -> float:
 
 
 def amplified(t: float) -> tuple[float, float]:
-    """An error that grows by half of itself in a tenth of a second, again and again."""
-    return 0.02 * 1.5 ** (10.0 * (t % 1.0)), 0.0
+    """An error that grows by half of itself in a tenth of a second, again and again after 3 s."""
+    return (0.02 * 1.5 ** (10.0 * (t % 1.0)) if t > 3.0 else 0.0), 0.0
 
 
 @pytest.mark.parametrize("every", [1, 10])
@@ -176,6 +176,8 @@ def test_one_that_reported_before_the_robot_was_carried_away_is_no_witness() -> 
         if track.is_loud:
             break
     assert track is not None
+    newcomer = track_of(positions(10.0, seed=2))._replace(since_ns=4 * SECOND + 1)
+    assert not is_refuted(track, [newcomer])  # it sees the robot only since then
     unaware = track_of(positions(4.0, seed=2))
     assert track.last.stamp_ns - unaware.last.stamp_ns < SECOND
     assert not is_refuted(track, [unaware])

@@ -108,7 +108,7 @@ def test_one_distance_that_odometry_contradicts_by_chance_gives_guests_no_majori
 
 
 def test_guests_that_are_quarantined_together_are_not_released_as_a_majority() -> None:
-    right = SenderRecord(last_report_ns=5 * SECOND, last_agreement_ns=5 * SECOND)
+    right = SenderRecord(last_report_ns=5 * SECOND, last_accepted_ns=5 * SECOND)
     senders = {"a": right, "b": right}
     for name in GUESTS:
         senders[name] = SenderRecord(
@@ -163,7 +163,7 @@ def test_a_sender_that_began_to_dissent_does_not_support_the_estimate() -> None:
         ),
         "east": SenderRecord(
             now_ns - 1,
-            last_agreement_ns=9 * SECOND,
+            last_accepted_ns=9 * SECOND,
             dispute_since_ns=now_ns - 1,
             last_failure_ns=now_ns - 1,
             odometry_conflicts=1.0,
@@ -183,7 +183,7 @@ def disputed(**scores: float) -> dict[str, SenderRecord]:
     return {
         name: SenderRecord(
             last_report_ns=now_ns - 1,
-            last_agreement_ns=now_ns - 1 if not score else 0,
+            last_accepted_ns=now_ns - 1 if not score else 0,
             dispute_since_ns=8 * SECOND if score else 0,
             score=score * RULES.limit,
         )
