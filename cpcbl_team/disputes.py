@@ -24,7 +24,12 @@ from cpcbl_team.mean_offsets import (
     lead,
 )
 from cpcbl_team.reported_tracks import ReportedPosition
-from cpcbl_team.sender_comparisons import SenderRecords, recent_senders, votes
+from cpcbl_team.sender_comparisons import (
+    SenderRecords,
+    members,
+    recent_senders,
+    votes,
+)
 from cpcbl_team.sender_records import (
     JUMP_SIGMAS,
     OWN_SENSORS,
@@ -41,10 +46,11 @@ LEAST_UNITED: Final = 2  # teammates that contradict the estimate together
 
 
 def score_bound(senders: SenderRecords, limit: float) -> float:
-    """The score beyond which a sender is in dispute with the estimate: half of the limit if another
-    one contradicts the estimate, too, for two seldom do so by chance at the same time."""
+    """The score beyond which a sender is in dispute with the estimate: half of the limit if two
+    robots of the team contradict the estimate, for these seldom do so by chance at the same time.
+    Anybody may come as several guests."""
     against = dissenting({n: r for n, r in senders.items() if r.reason is None}, limit)
-    is_joint = sum(name != OWN_SENSORS for name in against) >= LEAST_UNITED
+    is_joint = len(members(senders, against - {OWN_SENSORS})) >= LEAST_UNITED
     return 0.5 * limit if is_joint else limit
 
 

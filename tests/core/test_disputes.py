@@ -163,4 +163,6 @@ def test_dissenters_on_both_sides_of_the_estimate_are_not_one_side() -> None:
     both = {"honest": DISSENTER, "other": replace(DISSENTER, score=0.6 * LIMIT)}
     assert dissenting(both, LIMIT) == {"honest", "other"}
     assert score_bound(both, LIMIT) == 0.5 * LIMIT
+    guests = {name: replace(record, is_guest=True) for name, record in both.items()}
+    assert score_bound(guests, LIMIT) == LIMIT
     assert dissenting({"honest": replace(DISSENTER, score=0.4 * LIMIT)}, LIMIT) == set()
