@@ -4,7 +4,8 @@
    innovation squared (NIS) of the reports exceeds its usual size are added up to a score (a CUSUM;
    E. S. Page, Biometrika 41, 1954).
 2. Against odometry: the distance between two positions of this robot that a sender reported must be
-   the distance between them by odometry. This needs neither the heading nor a second sender.
+   the distance between them by odometry. This needs neither the heading nor a second sender. All
+   of its positions together are tested beside those of others (`reported_tracks.py`).
 
 What follows from them, and from the mean of the reports (`mean_offsets.py`), is in `trust.py`.
 """

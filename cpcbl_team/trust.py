@@ -195,8 +195,8 @@ def _decide_dispute(
     senders: SenderRecords, name: str, now_ns: int, used_ns: int, rules: TrustSettings
 ) -> TrustDecision:
     """Decides who is wrong if a sender has contradicted the estimate for long enough. A source
-    supports the estimate only if it agreed with it after the dispute began. If none does, no sender
-    is blamed: the robot detects by its innovations that it is lost."""
+    supports the estimate only if the estimate followed it after the dispute began. If none does, no
+    sender is blamed: the robot detects by its innovations that it is lost."""
     bound = score_bound(senders, rules.limit)
     is_dispute = any(r.score > bound for r in senders.values())
     recent = senders_with_a_say(senders, name, now_ns) if is_dispute else {}
