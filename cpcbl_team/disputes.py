@@ -126,21 +126,27 @@ def supporters_of_dissent(recent: SenderRecords, bound: float) -> set[str]:
     return {
         name
         for name, r in recent.items()
-        if (denial := r.denial) is not None
-        and (party := parties.get(denial.of)) is not None
-        and denial.since_ns == party.dispute_since_ns
-        and denial.chi_square < -USUAL
+        if (denied := _denied(r, parties)) is not None and denied < -USUAL
     }
+
+
+def _denied(record: SenderRecord, parties: SenderRecords) -> float | None:
+    """The chi-square of a source's denial of one of these senders, if it reported anything since
+    that one's dispute began."""
+    denial = record.denial
+    dissenter = None if denial is None else parties.get(denial.of)
+    if denial and dissenter and denial.since_ns == dissenter.dispute_since_ns:
+        return denial.chi_square
+    return None
 
 
 def _denies(record: SenderRecord, parties: SenderRecords) -> bool:
     """Whether a source is nearer to the estimate than to what these senders say, by more than usual
     noise. A source that is too vague to tell agrees with both sides. One without reports since the
     dispute began is judged by its mean, and one without a mean by its single reports."""
-    denial = record.denial
-    dissenter = None if denial is None else parties.get(denial.of)
-    if denial and dissenter and denial.since_ns == dissenter.dispute_since_ns:
-        return denial.chi_square > USUAL
+    denied = _denied(record, parties)
+    if denied is not None:
+        return denied > USUAL
     mean = record.means[FAST]
     if mean is None:
         return True

@@ -30,7 +30,6 @@ TURN_RAD_PER_SQRT_M: Final = math.radians(2.0)  # least sigma of a heading by od
 COURSE_SIGMA: Final = 0.25  # rad, of the course that gives a track its heading
 TURNED_SHARE: Final = 0.1  # of the noise: with a heading that adds more, no report is judged
 SIZE_SHARE: Final = 0.2  # with which the last innovation counts in their mean size
-NEVER_NS: Final = -(2**62)
 UNKNOWN: Final = Estimate(Pose2(0.0, 0.0, 0.0), Covariance3(1.0, 0.0, 1.0, 0.0, 0.0, 1.0))
 
 
@@ -52,6 +51,11 @@ class OdometryErrors(NamedTuple):
             noise.turn_sigma_rad_per_sqrt_rad**2,
         )
 
+    def distance_variance(self, distance: float) -> float:
+        """The variance (m^2) of a distance."""
+        scale = self.share * distance
+        return self.m2_per_m * distance + scale * scale
+
 
 class ReportedPosition(NamedTuple):
     """Where a sender reported this robot, in the field's frame, and its odometry at that time."""
@@ -72,10 +76,10 @@ class ReportedTrack(NamedTuple):
     first: ReportedPosition | None  # while the heading is not known yet
     last: ReportedPosition
     estimate: Estimate
-    since_ns: int = NEVER_NS  # when its heading became known
-    score: float = 0.0  # by how much the NIS of its reports exceeded what is between
-    loud_ns: int = NEVER_NS  # when the score was last above `QUIET`
-    half_ns: int = NEVER_NS  # and when it was last at most half of the limit
+    since_ns: int  # when its heading became known
+    loud_ns: int  # when the score was last above `QUIET`, or the track began,
+    half_ns: int  # and when the score was last at most half of the limit
+    score: float = 0.0  # the sum by which the NIS of its reports exceeded `BETWEEN_NIS`
     size_m2: float = 0.0  # exponential mean of the squared innovations, per axis
     variance: float = math.inf  # m^2, of the last innovation as predicted, in the mean of both axes
 
@@ -89,7 +93,7 @@ def with_reported(track: ReportedTrack | None, now: ReportedPosition) -> Reporte
     """The track with one more report. It begins anew after a gap of the odometry, which is bridged
     by a guess."""
     if track is None or track.last.gaps != now.gaps or _elapsed_ns(track, now) > LONGEST_NS:
-        return ReportedTrack(now, now, UNKNOWN, now.stamp_ns, half_ns=now.stamp_ns)
+        return ReportedTrack(now, now, UNKNOWN, now.stamp_ns, now.stamp_ns, now.stamp_ns)
     if _elapsed_ns(track, now) <= 0:
         return track
     if track.first is not None:
@@ -105,7 +109,7 @@ def with_reported(track: ReportedTrack | None, now: ReportedPosition) -> Reporte
     nis = innovation.mahalanobis_squared(ex, ey)
     score, (x, y, _) = track.score, motion.pose
     if (x * x + y * y) * track.estimate.covariance.hh < TURNED_SHARE * r:
-        score = min(max(0.0, score + min(nis, MOST_NIS) - BETWEEN_NIS), 2.0 * LIMIT)
+        score = cusum(score, min(nis, MOST_NIS) - BETWEEN_NIS, LIMIT)
     weight = 1.0 / r
     evidence = Covariance3(weight, 0.0, weight, 0.0, 0.0, 0.0), (weight * ex, weight * ey, 0.0)
     k, size_m2 = SIZE_SHARE, 0.5 * (ex * ex + ey * ey)
@@ -114,12 +118,18 @@ def with_reported(track: ReportedTrack | None, now: ReportedPosition) -> Reporte
         now,
         merge(before, evidence),
         track.since_ns,
-        score,
         now.stamp_ns if score > QUIET else track.loud_ns,
         now.stamp_ns if score <= 0.5 * LIMIT else track.half_ns,
+        score,
         (1.0 - k) * track.size_m2 + k * size_m2,
         0.5 * (innovation.xx + innovation.yy),
     )
+
+
+def cusum(score: float, excess: float, limit: float) -> float:
+    """The sum of test statistics beyond what is usual, after one more (E. S. Page, 1954). It is
+    bounded by twice its limit, so that it ends soon after its cause."""
+    return max(0.0, min(score + excess, 2.0 * limit))
 
 
 def is_refuted(track: ReportedTrack, others: Iterable[ReportedTrack]) -> bool:
@@ -167,6 +177,6 @@ def _motion(track: ReportedTrack, now: ReportedPosition) -> Estimate:
     distance, turn = math.sqrt(squared), abs(way.heading)
     turned = (SLIP_SHARE * turn) ** 2 + TURN_RAD_PER_SQRT_M**2 * distance
     turned += errors.rad2_per_m * distance + errors.rad2_per_rad * turn
-    along = (SLIP_SHARE * SLIP_SHARE + errors.share * errors.share) * squared
-    along += errors.m2_per_m * distance + 0.25 * squared * turned
+    along = SLIP_SHARE * SLIP_SHARE * squared + errors.distance_variance(distance)
+    along += 0.25 * squared * turned
     return Estimate(way, Covariance3(along, 0.0, along, 0.0, 0.0, turned))

@@ -31,7 +31,7 @@ from cpcbl_team.mean_offsets import (
     MeanOffset,
     by_whole_noise,
 )
-from cpcbl_team.reported_tracks import ReportedPosition, ReportedTrack, with_reported
+from cpcbl_team.reported_tracks import ReportedPosition, ReportedTrack, cusum, with_reported
 
 SILENCE_NS: Final = 10_000_000_000  # earlier reports count no longer after this silence
 USUAL_NIS = 6.0  # 95 % quantile of the chi-square distribution of two degrees of freedom
@@ -230,7 +230,7 @@ def _with_nis(
 ) -> SenderRecord:
     """Test 1: the innovation of a report against the estimate."""
     now = report.stamp_ns
-    score = max(0.0, min(record.score + min(nis, MOST_NIS) - USUAL_NIS, 2.0 * limit))
+    score = cusum(record.score, min(nis, MOST_NIS) - USUAL_NIS, limit)
     if score and not record.score and not record.reason:
         offset = report.offset or (0.0, 0.0)
         record = replace(record, dispute_since_ns=now, mean_offset=offset, offset_variance=0.0)
@@ -299,8 +299,8 @@ def distances_between(then: ReportedPosition, now: ReportedPosition) -> tuple[fl
     difference (m): wheels that are known to be noisy contradict nobody by that noise."""
     displacement = then.odometry_from_robot.inverse() @ now.odometry_from_robot
     driven = math.hypot(displacement.x, displacement.y)
-    slip, scale = SLIP_SHARE * driven + SLIP_M, now.errors.share * driven
-    of_odometry = slip * slip + now.errors.m2_per_m * driven + scale * scale
+    slip = SLIP_SHARE * driven + SLIP_M
+    of_odometry = slip * slip + now.errors.distance_variance(driven)
     sigma = math.sqrt(then.variance + now.variance + of_odometry)
     return math.hypot(now.x - then.x, now.y - then.y), driven, sigma
 

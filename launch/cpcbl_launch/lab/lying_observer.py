@@ -26,7 +26,7 @@ SIGMA_M = 0.01  # per axis, of its sightings and of its own position together
 HEADING_SIGMA = math.radians(1.0)
 TIER = 0
 GATE_SIGMAS = 2.0  # no fix is farther from the victim's pose than this
-AMPLIFIED_BY: Final = 1.3  # the error of the victim, by an echo that amplifies it
+ECHO_GAINS: Final = {"echoes": 1.0, "amplified": 1.3}  # times the error of the victim's own pose
 
 
 class LyingObserver:
@@ -52,7 +52,7 @@ class LyingObserver:
         self._fixes = {robot: bus.publisher(k, topics.FIX.qos) for robot, k in keys.items()}
         self._subscriber = Subscriber(bus, Truths, self._on_message)
         self._poses: dict[str, Pose] = {}
-        if sends in ("gated", "echoes", "amplified"):
+        if sends == "gated" or sends in ECHO_GAINS:
             self._pose_subscriber = Subscriber(bus, Pose, self._on_pose)
 
     def leave(self) -> None:
@@ -87,10 +87,8 @@ class LyingObserver:
         return encode_help(altered)
 
     def _fix_of(self, truth: Truth, stamp_ns: int) -> Fix:
-        seen: Truth | Pose = truth
-        if self._sends in ("echoes", "amplified") and stamp_ns >= self._from_ns:
-            seen = self._poses.get(truth.robot, truth)
-        k = AMPLIFIED_BY if self._sends == "amplified" else 1.0
+        k = ECHO_GAINS.get(self._sends, 0.0) if stamp_ns >= self._from_ns else 0.0
+        seen = self._poses.get(truth.robot, truth)
         said = (truth.x_m + k * (seen.x_m - truth.x_m), truth.y_m + k * (seen.y_m - truth.y_m))
         x, y = (v + self._random.gauss(0.0, SIGMA_M) for v in said)
         half = 0.5 * SIGMA_M**2
