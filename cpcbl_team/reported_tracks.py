@@ -109,7 +109,7 @@ def with_reported(track: ReportedTrack | None, now: ReportedPosition) -> Reporte
     nis = innovation.mahalanobis_squared(ex, ey)
     score, (x, y, _) = track.score, motion.pose
     if (x * x + y * y) * track.estimate.covariance.hh < TURNED_SHARE * r:
-        score = cusum(score, min(nis, MOST_NIS) - BETWEEN_NIS, LIMIT)
+        score = cusum(score, min(nis, MOST_NIS), BETWEEN_NIS, LIMIT)
     weight = 1.0 / r
     evidence = Covariance3(weight, 0.0, weight, 0.0, 0.0, 0.0), (weight * ex, weight * ey, 0.0)
     k, size_m2 = SIZE_SHARE, 0.5 * (ex * ex + ey * ey)
@@ -126,10 +126,10 @@ def with_reported(track: ReportedTrack | None, now: ReportedPosition) -> Reporte
     )
 
 
-def cusum(score: float, excess: float, limit: float) -> float:
+def cusum(score: float, value: float, usual: float, limit: float) -> float:
     """The sum of test statistics beyond what is usual, after one more (E. S. Page, 1954). It is
     bounded by twice its limit, so that it ends soon after its cause."""
-    return max(0.0, min(score + excess, 2.0 * limit))
+    return max(0.0, min(score + value - usual, 2.0 * limit))
 
 
 def is_refuted(track: ReportedTrack, others: Iterable[ReportedTrack]) -> bool:

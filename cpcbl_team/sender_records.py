@@ -230,7 +230,7 @@ def _with_nis(
 ) -> SenderRecord:
     """Test 1: the innovation of a report against the estimate."""
     now = report.stamp_ns
-    score = cusum(record.score, min(nis, MOST_NIS) - USUAL_NIS, limit)
+    score = cusum(record.score, min(nis, MOST_NIS), USUAL_NIS, limit)
     if score and not record.score and not record.reason:
         offset = report.offset or (0.0, 0.0)
         record = replace(record, dispute_since_ns=now, mean_offset=offset, offset_variance=0.0)
