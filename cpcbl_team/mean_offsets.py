@@ -10,6 +10,7 @@ exponentially: S. W. Roberts, Technometrics 1, 1959.)
 
 import math
 from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Final, NamedTuple
 
 from cpcbl_team.estimate import ZERO3, Covariance3, Sums
@@ -21,6 +22,7 @@ FAST_NS: Final = 1_500_000_000  # time constants with which reports fade: a fast
 SLOW_NS: Final = 6_000_000_000  # in the mean of a short time, a slow one in that of a long time
 FAST: Final = 0  # places of both means in a record
 SLOW: Final = 1
+DIRECT: Final = 2  # not in a record: how senders differ from each other, instead of the estimate
 LEAST_REPORTS: Final = 5.0  # with fewer, fading, a source has no mean
 MOST_SIGMA_M: Final = 0.15  # a source whose mean is less certain has no vote
 FAST_COMMON_M: Final = 0.01
@@ -47,6 +49,9 @@ class MeanOffset(NamedTuple):
     common_m: float = FAST_COMMON_M  # sigma of an error that never averages away
     stamp_ns: int = 0  # of its last report, and the variance (m^2, both axes) of the estimate then
     estimate_variance: float = 0.0
+    sender: str = ""
+    apart: Mapping[str, "MeanOffset"] = MappingProxyType({})
+    """Its difference from the means of other senders by name, where that was measured directly."""
 
     @property
     def length_m(self) -> float:
@@ -181,10 +186,12 @@ class FadingOffsets(NamedTuple):
         heading_variance: float,
         common_m: float = FAST_COMMON_M,
         estimate_variance: float = 0.0,
+        *,
+        least: float = LEAST_REPORTS,
     ) -> MeanOffset | None:
         """The mean of the reports, if they are enough to determine one. `heading_variance` (rad^2)
         and `estimate_variance` (m^2, both axes): those of the estimate."""
-        if self.reports < LEAST_REPORTS:
+        if self.reports < least:
             return None
         (xx, xy, yy), (x, y) = about_position(self.evidence, heading_variance)
         determinant = xx * yy - xy * xy
@@ -226,11 +233,20 @@ Means = Mapping[str, MeanOffset]
 
 def disagreement(one: MeanOffset, other: MeanOffset) -> float:
     """The chi-square of the difference of two means (two degrees of freedom)."""
-    x, y, (xx, xy, yy), common_m, _, _ = one
-    ox, oy, (oxx, oxy, oyy), other_m, _, _ = other
-    common = common_m * common_m + other_m * other_m + _growth(one, other)
-    sum_ = new(Covariance2, (xx + oxx + common, xy + oxy, yy + oyy + common))
-    return sum_.mahalanobis_squared(x - ox, y - oy)
+    x, y, (xx, xy, yy), growth = _difference(one, other)
+    common = one.common_m * one.common_m + other.common_m * other.common_m + growth
+    sum_ = new(Covariance2, (xx + common, xy, yy + common))
+    return sum_.mahalanobis_squared(x, y)
+
+
+def _difference(one: MeanOffset, other: MeanOffset) -> tuple[float, float, Covariance2, float]:
+    """The difference of two means, its covariance, and by how much the estimate may have changed
+    between the two; if it was measured directly, that difference."""
+    direct = one.apart.get(other.sender)
+    if direct is not None:
+        return direct.x, direct.y, direct.covariance, 0.0
+    covariance = one.covariance + other.covariance
+    return one.x - other.x, one.y - other.y, covariance, _growth(one, other)
 
 
 def contradicts(one: MeanOffset, other: MeanOffset) -> bool:
@@ -245,8 +261,8 @@ def bias_variance(one: MeanOffset, other: MeanOffset, *, apart: float | None = N
     C along both axes this is d^2 less the trace of C. `apart`: their disagreement, if known."""
     if (disagreement(one, other) if apart is None else apart) <= USUAL:
         return 0.0
-    dx, dy, growth = one.x - other.x, one.y - other.y, _growth(one, other)
-    (xx, xy, yy) = one.covariance + other.covariance + Covariance2(growth, 0.0, growth)
+    dx, dy, covariance, growth = _difference(one, other)
+    (xx, xy, yy) = covariance + Covariance2(growth, 0.0, growth)
     wx, wy = yy * dx - xy * dy, xx * dy - xy * dx  # times the determinant
     determinant, along = xx * yy - xy * xy, wx * dx + wy * dy
     excess = along * (along - 2.0 * determinant) / (wx * wx + wy * wy)

@@ -34,6 +34,7 @@ from cpcbl_team.miscalibration import (
 from cpcbl_team.recovery_evidence import WINDOW_NS, latest
 from cpcbl_team.relocalization import are_apart, readings_of, relocalize
 from cpcbl_team.sender_comparisons import SenderRecords, contest_m
+from cpcbl_team.sender_differences import without_pairs
 from cpcbl_team.sensor_mistakes import (
     MIRRORED,
     ExplainingMistake,
@@ -257,7 +258,7 @@ class Recovery:
         common, filters = calibration.common, calibration.filters
         memory = memory._replace(
             recovery=recovery,
-            teammates=teammates._replace(senders=senders, own=None),
+            teammates=teammates._replace(senders=without_pairs(senders), own=None),
             calibration=calibration._replace(
                 references=None,
                 filters=filters if all(f.used >= DETERMINED for f in filters) else (),

@@ -30,6 +30,7 @@ TURN_RAD_PER_SQRT_M: Final = math.radians(2.0)  # least sigma of a heading by od
 COURSE_SIGMA: Final = 0.25  # rad, of the course that gives a track its heading
 TURNED_SHARE: Final = 0.1  # of the noise: with a heading that adds more, no report is judged
 SIZE_SHARE: Final = 0.2  # with which the last innovation counts in their mean size
+NOTHING: Final = Covariance2(0.0, 0.0, 0.0)
 UNKNOWN: Final = Estimate(Pose2(0.0, 0.0, 0.0), Covariance3(1.0, 0.0, 1.0, 0.0, 0.0, 1.0))
 
 
@@ -68,6 +69,9 @@ class ReportedPosition(NamedTuple):
     turn_rad: float = 0.0  # the heading of the estimate minus that of odometry
     gaps: int = 0  # of the odometry until then
     errors: OdometryErrors = OdometryErrors()
+    noise: Covariance2 = NOTHING  # m^2, of this report alone,
+    dependent: Covariance2 = NOTHING  # and that which all reports of its sender have in common
+    turn_variance: float = 0.0  # rad^2, of `turn_rad`
 
 
 class ReportedTrack(NamedTuple):
@@ -102,7 +106,7 @@ def with_reported(track: ReportedTrack | None, now: ReportedPosition) -> Reporte
         return track._replace(
             first=first, last=now, estimate=start or UNKNOWN, since_ns=now.stamp_ns
         )
-    motion = _motion(track, now)
+    motion = motion_between(track.last, now)
     before = after_motion(track.estimate, motion)
     ex, ey, r = now.x - before.pose.x, now.y - before.pose.y, now.variance
     innovation = before.covariance.position() + Covariance2(r, 0.0, r)
@@ -170,9 +174,9 @@ def _start_of_track(first: ReportedPosition, now: ReportedPosition) -> Estimate 
     return Estimate(pose, Covariance3(r, 0.0, r, 0.0, 0.0, noise / squared))
 
 
-def _motion(track: ReportedTrack, now: ReportedPosition) -> Estimate:
-    """How the robot moved since the last report by odometry, in its frame at that time."""
-    way = track.last.odometry_from_robot.inverse() @ now.odometry_from_robot
+def motion_between(then: ReportedPosition, now: ReportedPosition) -> Estimate:
+    """How the robot moved between two reports by odometry, in its frame at the first one."""
+    way = then.odometry_from_robot.inverse() @ now.odometry_from_robot
     squared, errors = way.x * way.x + way.y * way.y, now.errors
     distance, turn = math.sqrt(squared), abs(way.heading)
     turned = (SLIP_SHARE * turn) ** 2 + TURN_RAD_PER_SQRT_M**2 * distance

@@ -23,6 +23,7 @@ from cpcbl_team.mean_comparisons import (
 from cpcbl_team.mean_headings import NO_TURNS, FadingTurns, MeanTurn, contradicting
 from cpcbl_team.mean_offsets import (
     ALTERNATING_NS,
+    DIRECT,
     FAST,
     SLOW,
     MeanOffset,
@@ -30,6 +31,7 @@ from cpcbl_team.mean_offsets import (
     disagreement,
 )
 from cpcbl_team.reported_tracks import is_refuted
+from cpcbl_team.sender_differences import ORIGIN, positions_about
 from cpcbl_team.sender_records import (
     NEVER_NS,
     OWN_SENSORS,
@@ -127,10 +129,17 @@ def voters(senders: SenderRecords, now_ns: int) -> list[str]:
     return members(senders, recent) + guests[: votes(senders, guests, recent)]
 
 
+def mean_of(senders: SenderRecords, name: str, of: int) -> MeanOffset | None:
+    """The mean of a sender (`of`: FAST or SLOW). With DIRECT, those of all others are about it."""
+    return ORIGIN if of == DIRECT else senders[name].means[of]
+
+
 def voting_means(senders: SenderRecords, now_ns: int, name: str, of: int) -> dict[str, MeanOffset]:
-    """The precise means (`of`: FAST or SLOW) of the recent sources except `name`, and of the silent
-    parties of contests with them. Guests are among them as far as they have a vote (see
+    """The precise means (`of`: FAST, SLOW or DIRECT) of the recent sources except `name`, and of
+    the silent parties of contests with them. Guests are among them as far as they have a vote (see
     `votes`)."""
+    if of == DIRECT:
+        return positions_about(senders, name, now_ns)
     silenced = doubted_guests(senders, now_ns)
     means = {
         other: mean
@@ -230,18 +239,28 @@ def contest_m(senders: SenderRecords, name: str) -> float:
 
 def compare(senders: SenderRecords, name: str, now_ns: int) -> Comparison | None:
     """The result of test 3; None while the sender has no recent mean that can be wrong. A majority
-    decides a contest only by both means. In a contest the estimate may move fast, and then means of
-    a long time differ if one sender reported more than another recently."""
-    fast, slow = (_comparison_of(senders, name, now_ns, of) for of in (FAST, SLOW))
+    decides a contest only by both means of offsets, or directly. In a contest the estimate may move
+    fast, and then means of a long time differ if one sender reported more than another recently."""
+    kinds = FAST, SLOW, DIRECT
+    fast, slow, direct = (_comparison_of(senders, name, now_ns, of) for of in kinds)
     found = fast or slow
     if fast is not None and slow is not None:
         found = both(fast, slow)
         is_unanimous = fast.is_wrong == slow.is_wrong
         if not is_unanimous and open_rivals(senders, name) and not _sees(senders, now_ns):
             found = found._replace(is_wrong=False, is_contested=True)
+    if direct is not None:
+        found = direct if found is None else both(direct, found)
     if wrong_turn(senders, name, now_ns) is None:
         return found
     return (found or Comparison())._replace(is_wrong=True, is_confirmed=False)
+
+
+def _is_seeing(senders: SenderRecords, now_ns: int, of: int) -> bool:
+    """Whether senders are compared with each other (DIRECT) by a robot whose own sensors measured
+    anything lately. These say nothing of such differences, but no majority outweighs them."""
+    own = senders.get(OWN_SENSORS)
+    return of == DIRECT and own is not None and _is_reporting(own, now_ns)
 
 
 def _sees(senders: SenderRecords, now_ns: int) -> bool:
@@ -252,12 +271,22 @@ def _sees(senders: SenderRecords, now_ns: int) -> bool:
 
 
 def _comparison_of(senders: SenderRecords, name: str, now_ns: int, of: int) -> Comparison | None:
-    """The result of test 3 with one mean of a sender (`of`: FAST or SLOW)."""
-    record, mean = senders[name], senders[name].means[of]
-    if record.offsets[of].stamp_ns != now_ns or mean is None or not mean.can_be_wrong:
+    """The result of test 3 with one mean of a sender (`of`: FAST, SLOW or DIRECT)."""
+    mean = mean_of(senders, name, of) if _is_of(senders[name], now_ns, of) else None
+    if mean is None or not mean.can_be_wrong:
         return None
     others = voting_means(senders, now_ns, name, of)
-    return _result(senders[name], mean, others, _recent_count(senders, others, now_ns))
+    if of == DIRECT and not others:
+        return None
+    heard = _recent_count(senders, others, now_ns)
+    return _result(senders[name], mean, others, heard, _is_seeing(senders, now_ns, of))
+
+
+def _is_of(record: SenderRecord, now_ns: int, of: int) -> bool:
+    """Whether a mean of a sender contains a report of now."""
+    if of != DIRECT:
+        return record.offsets[of].stamp_ns == now_ns
+    return record.last_position is not None and record.last_position.stamp_ns == now_ns
 
 
 def _recent_count(senders: SenderRecords, voting: Collection[str], now_ns: int) -> int:
@@ -271,11 +300,16 @@ def _recent_count(senders: SenderRecords, voting: Collection[str], now_ns: int) 
 
 
 def _result(
-    record: SenderRecord, mean: MeanOffset, others: Mapping[str, MeanOffset], heard: int
+    record: SenderRecord,
+    mean: MeanOffset,
+    others: Mapping[str, MeanOffset],
+    heard: int,
+    is_seeing: bool = False,
 ) -> Comparison:
-    """What the others say of a sender's mean: the robot's own sensors, or else the majority."""
+    """What the others say of a sender's mean: the robot's own sensors, or else the majority.
+    `is_seeing`: the robot has own sensors, although these are not among the others."""
     own, behind = others.get(OWN_SENSORS), record.behind
-    if own is None and not any(name in others for name in behind):
+    if own is None and not is_seeing and not any(name in others for name in behind):
         return compared_with_majority(mean, others)
     of_senders = {name: other for name, other in others.items() if name != OWN_SENSORS}
     return compared_with_own_sensors(mean, own, of_senders, heard, behind)
@@ -326,16 +360,17 @@ def _contradicted(senders: SenderRecords, name: str, now_ns: int) -> tuple[Rival
     """The senders that the mean of this one contradicts, without those that the others find
     wrong."""
     found = {}
-    for of in (SLOW, FAST):
-        mean = senders[name].means[of]
+    for of in (SLOW, FAST, DIRECT):
+        mean = mean_of(senders, name, of)
         if mean is None or not mean.is_precise:
             continue
         means = {name: mean, **voting_means(senders, now_ns, name, of)}
         heard = _recent_count(senders, means, now_ns)
+        is_seeing = _is_seeing(senders, now_ns, of)
         for other, its in means.items():
             if other == OWN_SENSORS or not contradicts(mean, its):
                 continue
             rest = {n: m for n, m in means.items() if n != other}
-            if not _result(senders[other], its, rest, heard).is_wrong:
+            if not _result(senders[other], its, rest, heard, is_seeing).is_wrong:
                 found[other] = Rival(other, its.x - mean.x, its.y - mean.y)
     return tuple(found.values())

@@ -31,6 +31,7 @@ from cpcbl_team.mean_offsets import (
     MeanOffset,
     by_whole_noise,
 )
+from cpcbl_team.position_pairs import NO_PAIRS, PositionPairs
 from cpcbl_team.reported_tracks import ReportedPosition, ReportedTrack, cusum, with_reported
 
 SILENCE_NS: Final = 10_000_000_000  # earlier reports count no longer after this silence
@@ -163,6 +164,8 @@ class SenderRecord(msgspec.Struct, frozen=True, gc=False):
     """m^2: of the error that its reports may have in common, by what others say."""
     rivals: tuple[Rival, ...] = ()
     """With whom it is in a contest, until that is decided: also while either is silent."""
+    last_position: ReportedPosition | None = None  # also if another one is compared in test 2
+    pairs: PositionPairs = NO_PAIRS  # of its reports with those of senders of an earlier name
     denial: Denial | None = None  # of the sender that contradicts the estimate most
     wrong_ns: int = NEVER_NS  # since when others say without interruption that its mean is wrong
     own_nis: float = 0.0  # of its last report, against the pose by own sensors
@@ -262,7 +265,7 @@ def _with_position(record: SenderRecord, now: ReportedPosition | None) -> Sender
     then = record.position
     if now is None:
         return record
-    record = replace(record, track=with_reported(record.track, now))
+    record = replace(record, track=with_reported(record.track, now), last_position=now)
     if then is None or now.stamp_ns - then.stamp_ns > SILENCE_NS:
         return replace(record, position=now)
     if now.stamp_ns <= then.stamp_ns:

@@ -30,7 +30,7 @@ from cpcbl_team.disputes import (
     with_denial,
 )
 from cpcbl_team.mean_comparisons import EVIDENCE_ON_MOST, Comparison
-from cpcbl_team.mean_offsets import FAST, disagreement
+from cpcbl_team.mean_offsets import DIRECT, FAST, disagreement
 from cpcbl_team.overturned_quarantines import outvoted_majority, witnesses_of_contest
 from cpcbl_team.sender_comparisons import (
     RECENT_NS,
@@ -38,6 +38,7 @@ from cpcbl_team.sender_comparisons import (
     compare,
     contest_m,
     is_left_out_guest,
+    mean_of,
     members,
     open_rivals,
     recent_senders,
@@ -50,6 +51,7 @@ from cpcbl_team.sender_comparisons import (
     with_track_result,
     wrong_turn,
 )
+from cpcbl_team.sender_differences import with_pairs
 from cpcbl_team.sender_records import (
     BY_COMPARISON,
     CONTRADICTING_NIS,
@@ -149,7 +151,8 @@ def _decide(
     record = with_report(senders.get(name, SenderRecord()), report, rules.limit)
     record = with_track_result({**senders, name: record}, name)
     record = with_denial(record, senders, name, report)
-    senders = {**senders, name: record}
+    senders = with_pairs({**senders, name: record}, name)
+    record = senders[name]
     comparison = compare(senders, name, now)
     if comparison is not None:
         record = with_comparison(senders, name, comparison, now)
@@ -180,7 +183,9 @@ def _quarantine_by_mean(senders: SenderRecords, name: str, now_ns: int) -> Trust
         changed = {**senders, name: quarantined(senders[name], QuarantineReason.HEADING, now_ns)}
         turned = abs(right_turn.rad)
         return TrustDecision(changed, False, "quarantined", frozenset((name,)), 0.0, turned)
-    mean, means = senders[name].means[FAST], voting_means(senders, now_ns, name, FAST)
+    of = DIRECT if senders[name].means[FAST] is None else FAST
+    mean = mean_of(senders, name, of)
+    means = voting_means(senders, now_ns, name, of)
     if mean is None or not means:
         return TrustDecision(senders, False)
     farthest = max(means.values(), key=lambda other: disagreement(mean, other))

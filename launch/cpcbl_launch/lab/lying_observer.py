@@ -1,6 +1,6 @@
 """An observer that always sees its victims and lies to them, for experiments in one process.
 
-It is an attacker with a valid name that knows the truth: ten times a second it sends every victim a
+It is an attacker with a valid name that knows the truth: again and again it sends every victim a
 fix, and its own belief, as a `Fault` alters them. It is a strong liar, because it sees its victims
 everywhere and spends no budget. It may read the poses that they publish, as every member may, and
 say nothing that their gates would reject.
@@ -21,7 +21,7 @@ from cpcbl_transport.compact import encode_help
 from cpcbl_transport.decoding import Received, Subscriber
 from cpcbl_transport.messages import Pose, Row3, Truth, Truths
 
-PERIOD_NS: Final = 100_000_000
+USUAL_HZ: Final = 10.0  # reports a second
 SIGMA_M = 0.01  # per axis, of its sightings and of its own position together
 HEADING_SIGMA = math.radians(1.0)
 TIER = 0
@@ -33,14 +33,21 @@ class LyingObserver:
     """A node of `run_nodes`. The same truth, fault, name and seed give the same messages."""
 
     def __init__(
-        self, bus: Bus, name: str, victims: Sequence[str], fault: Fault, seed: int, sends: str
+        self,
+        bus: Bus,
+        name: str,
+        victims: Sequence[str],
+        fault: Fault,
+        seed: int,
+        sends: str,
+        reports_hz: float = USUAL_HZ,
     ) -> None:
         """`sends`: "fixes", "headings" (fixes with a heading), "gated" (fixes within the gate of
         the victim's own pose), "echoes" (the victim's own pose in place of the truth),
         "amplified" (that pose, with 1.3 times its error) or "beliefs"."""
         self.next_ns = 0
         self.waiting = False
-        self._name, self._sends = name, sends
+        self._name, self._sends, self._period_ns = name, sends, round(1e9 / reports_hz)
         self._from_ns = round(fault.from_s * 1e9)
         self._injector = FaultInjector(fault, name, 0)
         self._random = random.Random(f"{name} {seed}")
@@ -61,7 +68,7 @@ class LyingObserver:
 
     def step(self, now_ns: int) -> None:
         """Sends what it says of the robots as they were when the truth was last published."""
-        self.next_ns = now_ns + PERIOD_NS
+        self.next_ns = now_ns + self._period_ns
         if self._truths is None:
             return
         for truth in self._truths.robots:

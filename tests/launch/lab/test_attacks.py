@@ -10,6 +10,7 @@ from support.quarantine_use import QuarantineUse, watched_quarantines
 
 from cpcbl_launch.lab.experiments import attacks
 from cpcbl_launch.lab.experiments.attacks import Attack, AttackRow, attack_rows, run_attack
+from cpcbl_launch.lab.lying_observer import USUAL_HZ
 
 EVERY = {(attack.name, attack.victim): attack for attack in attacks.attacks()}
 SHORT = [
@@ -136,6 +137,26 @@ def test_an_echo_that_amplifies_leads_no_blind_robot_astray(seed: int) -> None:
 
 
 @pytest.mark.thorough
+@pytest.mark.parametrize("name", ["drift", "overclaimed"])
+def test_liars_are_found_where_all_report_twice_a_second(name: str) -> None:
+    """Means of what they say of the estimate found them late, and put correct observers into
+    quarantine: ratios of 1.91 and 1.65, 84 and 79 % inside 3 sigma."""
+    _, row = rows_of([EVERY[f"{name}, 2 Hz", "scout"]], [2])
+    assert row.held
+    assert row.worst_ratio < 1.3
+    assert row.least_inside_3_sigma > 0.92
+    assert row.false_quarantines == 0
+
+
+@pytest.mark.thorough
+def test_without_a_majority_sigma_holds_where_all_report_twice_a_second() -> None:
+    _, row = rows_of([EVERY["no majority, 2 Hz", "scout"]], [1])
+    assert row.noticed == 1
+    assert row.least_inside_3_sigma > 0.9  # 78 % before
+    assert row.false_quarantines == 0  # two in seeds 1 and 2 before
+
+
+@pytest.mark.thorough
 def test_the_runs_to_compare_with_have_no_liar(short: dict[tuple[str, str], AttackRow]) -> None:
     for key in (("", "scout"), ("", "navigator")):
         assert short[key].worst_ratio == 1.0
@@ -163,7 +184,8 @@ def test_the_table_says_which_aims_are_missed(
 @pytest.mark.timeout(7200)
 def test_every_aim_but_those_of_poor_eyes_holds_in_twenty_seeds() -> None:
     """Two liars of four mislead a navigator for some seconds (docs/trust.md)."""
-    rows = rows_of(attacks.attacks(), range(3000, 3020))
+    often = [attack for attack in attacks.attacks() if attack.reports_hz == USUAL_HZ]
+    rows = rows_of(often, range(3000, 3020))
     missed = [(row.attack.name, row.attack.victim) for row in rows if not row.held]
     missed_by_poor_eyes = {(name, "navigator") for name in ("drift", "overclaimed", "sleeper")}
     assert set(missed) <= missed_by_poor_eyes

@@ -17,7 +17,7 @@ from rich.console import RenderableType
 
 from cpcbl_launch.lab.experiments.trust_watch import TrustWatch
 from cpcbl_launch.lab.faulty_robot import Fault
-from cpcbl_launch.lab.lying_observer import LyingObserver, RenamedLiar
+from cpcbl_launch.lab.lying_observer import USUAL_HZ, LyingObserver, RenamedLiar
 from cpcbl_launch.reporting.metrics import Score, score
 from cpcbl_launch.reporting.recorder import Recorder
 from cpcbl_launch.reporting.tables import number, table
@@ -25,7 +25,7 @@ from cpcbl_launch.simulation.field import SimulatedField
 from cpcbl_launch.simulation.field_node import FieldNode
 from cpcbl_launch.simulation.in_process import robot_nodes, run_nodes
 from cpcbl_launch.team.file import builtin_path, load_team
-from cpcbl_team.config import Team
+from cpcbl_team.config import RobotSettings, Team
 from cpcbl_transport.memory_bus import MemoryHub
 
 HONEST = ("north", "south")
@@ -36,6 +36,8 @@ CERTAIN = "drift:0.0,0.0,0.01"  # it adds nothing, and states 1 cm
 ONE_AXIS = "one-axis:0.02,0.005,0.25"  # 2 cm/s in x, where it states 5 mm, and 25 cm in y
 LEAST_INSIDE = 0.95  # of the victim's samples within 3 sigma, where nobody can find the liars
 OWN_EYES_RATIO, BLIND_RATIO = 1.3, 1.5
+RARE_HZ = 2.0
+OF_RARE_REPORTS = "drift", "overclaimed", "echo", "no majority"
 NAVIGATOR = {"victim": "navigator", "most_ratio": OWN_EYES_RATIO}
 
 
@@ -52,6 +54,7 @@ class Attack(Struct, frozen=True, kw_only=True):
     bystanders: tuple[str, ...] = ()  # driving robots to which the liars report, too
     honest: tuple[str, ...] = HONEST  # correct observers
     renamed_every_s: float | None = None  # liars come back under another name so often
+    reports_hz: float = USUAL_HZ  # of all sensors, and of the liars
     from_s: float = 10.0
     end_s: float = 70.0
 
@@ -113,6 +116,12 @@ def attacks() -> tuple[Attack, ...]:
         replace(renamed, name="new names, one robot", liars=GUESTS, honest=("north",)),
         replace(sudden, name="guests, one robot", liars=GUESTS, honest=("north",), most_ratio=None),
     ]
+    rare = {"reports_hz": RARE_HZ}
+    cases += [
+        replace(case, name=f"{case.name}, {RARE_HZ:g} Hz", **rare)
+        for case in cases
+        if case.name in OF_RARE_REPORTS
+    ]
     return tuple(replace(case, lie=case.lie.format(victim=case.victim)) for case in cases)
 
 
@@ -130,7 +139,12 @@ def attack_team(attack: Attack) -> Team:
     assert west.start is not None
     start = replace(west.start, x_m=9.0, heading_deg=180.0)
     robots = {**team.robots, "east": replace(west, start=start)}
-    return replace(team, robots={name: r for name, r in robots.items() if name in kept})
+    return replace(team, robots={n: _at_rate(r, attack) for n, r in robots.items() if n in kept})
+
+
+def _at_rate(robot: RobotSettings, attack: Attack) -> RobotSettings:
+    """The robot with a sensor that has so many frames a second."""
+    return replace(robot, sensor=replace(robot.sensor, rate_hz=attack.reports_hz))
 
 
 def run_attack(attack: Attack, seed: int) -> AttackRun:
@@ -164,7 +178,8 @@ def _lying_observer(
     told = attack.victim, *attack.bystanders
 
     def new(name: str) -> LyingObserver:
-        return LyingObserver(hub.session(), name, told, fault, seed, attack.sends)
+        how = attack.sends, attack.reports_hz
+        return LyingObserver(hub.session(), name, told, fault, seed, *how)
 
     every_s = attack.renamed_every_s
     return new(name) if every_s is None else RenamedLiar(new, name, every_s)
@@ -247,4 +262,6 @@ def _cells(row: AttackRow, seeds: int) -> list[str]:
 def _title(attack: Attack) -> str:
     if attack.liars:
         return attack.name
+    if attack.reports_hz != USUAL_HZ:
+        return f"no liar, {attack.reports_hz:g} Hz"
     return "no liar" if attack.end_s < 100.0 else "later"

@@ -1,0 +1,97 @@
+"""How far apart senders say that this robot is, by pairs of their reports (`position_pairs.py`)."""
+
+from collections.abc import Mapping
+from typing import Final
+
+from msgspec.structs import replace
+
+from cpcbl_team.mean_offsets import FAST, NOTHING, FadingOffsets, MeanOffset, contradicts
+from cpcbl_team.position_pairs import (
+    LEAST_PAIRS,
+    LONGEST_PAIR_NS,
+    NO_PAIRS,
+    PositionPairs,
+    with_pair,
+)
+from cpcbl_team.sender_records import SILENCE_NS, SenderRecord
+
+REMEMBERED_NS: Final = 60_000_000_000  # older pairs are forgotten
+MOST_PARTNERS: Final = 12  # with whose reports those of one sender are paired
+ORIGIN: Final = MeanOffset(0.0, 0.0, NOTHING)  # the mean position of a sender, about itself
+
+
+def with_pairs(senders: Mapping[str, SenderRecord], name: str) -> dict[str, SenderRecord]:
+    """The records after the last position that this sender reported was paired with those that
+    others reported before. The record of the later name of two has their pairs."""
+    found, now = dict(senders), senders[name].last_position
+    if now is None or now.stamp_ns != senders[name].last_report_ns:
+        return found
+    for other in _partners(senders, name, now.stamp_ns):
+        then = senders[other].last_position
+        first, later = sorted((name, other))
+        pairs, sign = found[later].pairs, 1.0 if name == later else -1.0
+        before = pairs.get(first, FadingOffsets())
+        sums = before if then is None else with_pair(before, then, now, sign)
+        if sums is not before:
+            kept = _not_old(pairs, now.stamp_ns)
+            found[later] = replace(found[later], pairs={**kept, first: sums})
+    return found
+
+
+def _partners(senders: Mapping[str, SenderRecord], name: str, now_ns: int) -> list[str]:
+    """The robots of the team that reported a position lately. Anybody may come as several guests,
+    so these are compared by what they say of the estimate only."""
+    if senders[name].is_guest:
+        return []
+    names = [
+        n
+        for n, r in senders.items()
+        if n != name
+        and r.last_position is not None
+        and not r.is_guest
+        and now_ns - r.last_position.stamp_ns <= LONGEST_PAIR_NS
+    ]
+    return sorted(names)[:MOST_PARTNERS]
+
+
+def without_pairs(senders: Mapping[str, SenderRecord]) -> Mapping[str, SenderRecord]:
+    """The records of a robot whose heading was wrong, and with it the way between two reports."""
+    if not any(record.pairs for record in senders.values()):
+        return senders
+    return {n: replace(r, pairs=NO_PAIRS, last_position=None) for n, r in senders.items()}
+
+
+def _not_old(pairs: PositionPairs, now_ns: int) -> PositionPairs:
+    return {n: sums for n, sums in pairs.items() if now_ns - sums.stamp_ns <= REMEMBERED_NS}
+
+
+def differences(senders: Mapping[str, SenderRecord], name: str) -> dict[str, MeanOffset]:
+    """The mean position of this sender minus that of each other one, where enough pairs of their
+    reports tell it."""
+    sums = [(other, pair, 1.0) for other, pair in senders[name].pairs.items()]
+    sums += [(n, pair, -1.0) for n, r in senders.items() if (pair := r.pairs.get(name)) is not None]
+    means = ((other, pair.mean(1.0, least=LEAST_PAIRS), sign) for other, pair, sign in sums)
+    return {
+        other: mean._replace(x=sign * mean.x, y=sign * mean.y)
+        for other, mean, sign in means
+        if mean is not None
+    }
+
+
+def positions_about(
+    senders: Mapping[str, SenderRecord], name: str, now_ns: int
+) -> dict[str, MeanOffset]:
+    """The mean positions of others minus that of this sender (`ORIGIN`), without those in
+    quarantine, and without old or vague ones. Two that both report often are compared by what they
+    say of the estimate. If any contradicts this sender, they know their differences from each
+    other."""
+    is_rare, found = senders[name].means[FAST] is None, dict[str, MeanOffset]()
+    for other, mean in differences(senders, name).items():
+        record, is_recent = senders.get(other), now_ns - mean.stamp_ns <= SILENCE_NS
+        if record is None or record.reason is not None:
+            continue
+        if (is_rare or record.means[FAST] is None) and is_recent and mean.is_precise:
+            found[other] = mean._replace(x=-mean.x, y=-mean.y, sender=other)
+    if not any(contradicts(ORIGIN, mean) for mean in found.values()):
+        return found
+    return {n: mean._replace(apart=differences(senders, n)) for n, mean in found.items()}
