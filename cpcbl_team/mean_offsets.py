@@ -143,6 +143,12 @@ def by_whole_noise(evidence: Sums, dependent: Covariance2) -> tuple[Sums, Covari
     return evidence, product(Covariance2(*evidence[0][:3]), dependent)
 
 
+def weighted(evidence: Sums, weight: float) -> Sums:
+    """The evidence with this weight, below one for what may be an outlier."""
+    matrix, (x, y, h) = evidence
+    return Covariance3(*(weight * a for a in matrix)), (weight * x, weight * y, weight * h)
+
+
 class FadingOffsets(NamedTuple):
     """Fading sums over the reports of one source."""
 

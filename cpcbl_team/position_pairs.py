@@ -6,14 +6,14 @@ from one report to the next than correct senders differ. The mean of many pairs 
 than one of them, as in `mean_offsets.py`.
 """
 
-import math
 from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Final
 
 from cpcbl_team.estimate import Covariance3, Sums
 from cpcbl_team.gaussian import Covariance2
-from cpcbl_team.mean_offsets import FadingOffsets, by_whole_noise
+from cpcbl_team.geometry import Pose2
+from cpcbl_team.mean_offsets import FadingOffsets, by_whole_noise, weighted
 from cpcbl_team.reported_tracks import ReportedPosition, motion_between
 
 LONGEST_PAIR_NS: Final = 2_000_000_000  # between the two reports of a pair
@@ -41,9 +41,8 @@ def with_pair(
     motion = motion_between(then, now)
     way_x, way_y, _ = motion.pose
     heading = then.odometry_from_robot.heading + now.turn_rad
-    c, s = math.cos(heading), math.sin(heading)
-    x = sign * (now.x - then.x - (c * way_x - s * way_y))
-    y = sign * (now.y - then.y - (s * way_x + c * way_y))
+    expected = Pose2(then.x, then.y, heading) @ motion.pose
+    x, y = sign * (now.x - expected.x), sign * (now.y - expected.y)
     turned = (way_x * way_x + way_y * way_y) * now.turn_variance
     moved = motion.covariance.xx + turned + LEAST_VARIANCE
     noise = then.noise + now.noise + Covariance2(moved, 0.0, moved)
@@ -52,7 +51,7 @@ def with_pair(
     chi_square = (noise + dependent).mahalanobis_squared(x, y)
     if chi_square > CLEAR:
         weight = CLEAR / chi_square
-        evidence, of_all = _weighted(evidence, weight), of_all.scaled(weight)
+        evidence, of_all = weighted(evidence, weight), of_all.scaled(weight)
     since_ns = now.stamp_ns - sums.stamp_ns
     fading_ns = min(max(FADING_NS, FADING_PAIRS * since_ns), LONGEST_FADING_NS)
     return sums.with_report(now.stamp_ns, fading_ns, evidence, of_all)
@@ -60,11 +59,5 @@ def with_pair(
 
 def _sums(noise: Covariance2, x: float, y: float) -> Sums:
     """What a difference with this noise says: information matrix and vector."""
-    k = 1.0 / (noise.xx * noise.yy - noise.xy * noise.xy)
-    xx, xy, yy = k * noise.yy, -k * noise.xy, k * noise.xx
+    xx, xy, yy = noise.inverse()
     return Covariance3(xx, xy, yy, 0.0, 0.0, 0.0), (xx * x + xy * y, xy * x + yy * y, 0.0)
-
-
-def _weighted(evidence: Sums, weight: float) -> Sums:
-    matrix, (x, y, h) = evidence
-    return Covariance3(*(weight * a for a in matrix)), (weight * x, weight * y, weight * h)

@@ -17,6 +17,7 @@ from cpcbl_team.config import OdometrySettings
 from cpcbl_team.estimate import Covariance3, Estimate, merge
 from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.geometry import Pose2, wrap_angle
+from cpcbl_team.mean_offsets import NOTHING
 from cpcbl_team.motion import after_motion
 
 BETWEEN_NIS: Final = 3.5  # between that of correct senders (2) and of those that are to be found
@@ -30,7 +31,6 @@ TURN_RAD_PER_SQRT_M: Final = math.radians(2.0)  # least sigma of a heading by od
 COURSE_SIGMA: Final = 0.25  # rad, of the course that gives a track its heading
 TURNED_SHARE: Final = 0.1  # of the noise: with a heading that adds more, no report is judged
 SIZE_SHARE: Final = 0.2  # with which the last innovation counts in their mean size
-NOTHING: Final = Covariance2(0.0, 0.0, 0.0)
 UNKNOWN: Final = Estimate(Pose2(0.0, 0.0, 0.0), Covariance3(1.0, 0.0, 1.0, 0.0, 0.0, 1.0))
 
 

@@ -19,7 +19,7 @@ from typing import Final, NamedTuple
 import msgspec
 from msgspec.structs import replace
 
-from cpcbl_team.estimate import Covariance3, Sums
+from cpcbl_team.estimate import Sums
 from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.mean_headings import COURSE_VARIANCE, NO_TURNS, FadingTurns
 from cpcbl_team.mean_offsets import (
@@ -30,6 +30,7 @@ from cpcbl_team.mean_offsets import (
     FadingOffsets,
     MeanOffset,
     by_whole_noise,
+    weighted,
 )
 from cpcbl_team.position_pairs import NO_PAIRS, PositionPairs
 from cpcbl_team.reported_tracks import ReportedPosition, ReportedTrack, cusum, with_reported
@@ -88,9 +89,7 @@ class OffsetEvidence(NamedTuple):
         move the mean for seconds, and without it the mean would seem to agree."""
         if weight == 1.0:
             return self
-        matrix, (x, y, h) = self.evidence
-        scaled = Covariance3(*(weight * a for a in matrix))
-        return self._replace(evidence=(scaled, (weight * x, weight * y, weight * h)))
+        return self._replace(evidence=weighted(self.evidence, weight))
 
 
 class TeammateReport(NamedTuple):
