@@ -139,7 +139,9 @@ def voting_means(senders: SenderRecords, now_ns: int, name: str, of: int) -> dic
     the silent parties of contests with them. Guests are among them as far as they have a vote (see
     `votes`)."""
     if of == DIRECT:
-        return positions_about(senders, name, now_ns)
+        means = positions_about(senders, name, now_ns)
+        silent = _means_of_silent(senders, name, means, now_ns, of) if means else {}
+        return {**silent, **means}
     silenced = doubted_guests(senders, now_ns)
     means = {
         other: mean
@@ -177,19 +179,22 @@ def _means_of_silent(
 ) -> dict[str, MeanOffset]:
     """What the silent parties of open contests would say now, by what their rivals say."""
     found: dict[str, MeanOffset] = {}
-    for present, mean in {name: senders[name].means[of], **means}.items():
+    for present, mean in {name: mean_of(senders, name, of), **means}.items():
         rivals = open_rivals(senders, present)
-        if not rivals or mean is None or _is_silent(senders[present], now_ns):
+        if not rivals or mean is None or _is_silent(senders[present], now_ns, of):
             continue
         for rival in rivals:
-            if rival.name != name and _is_silent(senders[rival.name], now_ns):
-                moved = mean._replace(x=mean.x + rival.x, y=mean.y + rival.y)
+            if rival.name != name and _is_silent(senders[rival.name], now_ns, of):
+                x, y = mean.x + rival.x, mean.y + rival.y
+                moved = mean._replace(x=x, y=y, sender=rival.name, apart={})
                 found.setdefault(rival.name, moved)
     return found
 
 
-def _is_silent(record: SenderRecord, now_ns: int) -> bool:
+def _is_silent(record: SenderRecord, now_ns: int, of: int) -> bool:
     """Whether a sender has no mean of the present, so that the last one may be out of date."""
+    if of == DIRECT:
+        return not _is_reporting(record, now_ns)
     mean = record.means[FAST]
     return mean is None or now_ns - mean.stamp_ns > ALTERNATING_NS
 

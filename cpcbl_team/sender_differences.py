@@ -5,9 +5,11 @@ from typing import Final
 
 from msgspec.structs import replace
 
-from cpcbl_team.mean_offsets import FAST, NOTHING, FadingOffsets, MeanOffset, contradicts
+from cpcbl_team.gaussian import Covariance2
+from cpcbl_team.mean_offsets import FadingOffsets, MeanOffset, contradicts
 from cpcbl_team.position_pairs import (
     LEAST_PAIRS,
+    LEAST_VARIANCE,
     LONGEST_PAIR_NS,
     NO_PAIRS,
     PositionPairs,
@@ -16,8 +18,10 @@ from cpcbl_team.position_pairs import (
 from cpcbl_team.sender_records import SILENCE_NS, SenderRecord
 
 REMEMBERED_NS: Final = 60_000_000_000  # older pairs are forgotten
+RARE_NS: Final = 300_000_000  # between two reports: with fewer, a mean of 1.5 s has too few
 MOST_PARTNERS: Final = 12  # with whose reports those of one sender are paired
-ORIGIN: Final = MeanOffset(0.0, 0.0, NOTHING)  # the mean position of a sender, about itself
+ORIGIN: Final = MeanOffset(0.0, 0.0, Covariance2(LEAST_VARIANCE, 0.0, LEAST_VARIANCE))
+"""The mean position of a sender, about itself."""
 
 
 def with_pairs(senders: Mapping[str, SenderRecord], name: str) -> dict[str, SenderRecord]:
@@ -85,12 +89,13 @@ def positions_about(
     quarantine, and without old or vague ones. Two that both report often are compared by what they
     say of the estimate. If any contradicts this sender, they know their differences from each
     other."""
-    is_rare, found = senders[name].means[FAST] is None, dict[str, MeanOffset]()
+    interval_ns, found = senders[name].interval_ns, dict[str, MeanOffset]()
     for other, mean in differences(senders, name).items():
         record, is_recent = senders.get(other), now_ns - mean.stamp_ns <= SILENCE_NS
         if record is None or record.reason is not None:
             continue
-        if (is_rare or record.means[FAST] is None) and is_recent and mean.is_precise:
+        is_rare = max(interval_ns, record.interval_ns) > RARE_NS
+        if is_rare and is_recent and mean.is_precise:
             found[other] = mean._replace(x=-mean.x, y=-mean.y, sender=other)
     if not any(contradicts(ORIGIN, mean) for mean in found.values()):
         return found

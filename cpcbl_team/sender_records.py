@@ -32,7 +32,7 @@ from cpcbl_team.mean_offsets import (
     by_whole_noise,
     weighted,
 )
-from cpcbl_team.position_pairs import NO_PAIRS, PositionPairs
+from cpcbl_team.position_pairs import LONGEST_PAIR_NS, NO_PAIRS, PositionPairs
 from cpcbl_team.reported_tracks import ReportedPosition, ReportedTrack, cusum, with_reported
 
 SILENCE_NS: Final = 10_000_000_000  # earlier reports count no longer after this silence
@@ -164,6 +164,7 @@ class SenderRecord(msgspec.Struct, frozen=True, gc=False):
     rivals: tuple[Rival, ...] = ()
     """With whom it is in a contest, until that is decided: also while either is silent."""
     last_position: ReportedPosition | None = None  # also if another one is compared in test 2
+    interval_ns: int = 0  # smoothed, between two positions that it reported
     pairs: PositionPairs = NO_PAIRS  # of its reports with those of senders of an earlier name
     denial: Denial | None = None  # of the sender that contradicts the estimate most
     wrong_ns: int = NEVER_NS  # since when others say without interruption that its mean is wrong
@@ -264,7 +265,9 @@ def _with_position(record: SenderRecord, now: ReportedPosition | None) -> Sender
     then = record.position
     if now is None:
         return record
-    record = replace(record, track=with_reported(record.track, now), last_position=now)
+    interval_ns = _with_interval(record, now.stamp_ns)
+    track = with_reported(record.track, now)
+    record = replace(record, track=track, last_position=now, interval_ns=interval_ns)
     if then is None or now.stamp_ns - then.stamp_ns > SILENCE_NS:
         return replace(record, position=now)
     if now.stamp_ns <= then.stamp_ns:
@@ -288,6 +291,14 @@ def _with_position(record: SenderRecord, now: ReportedPosition | None) -> Sender
     # While the robot stands, a frozen sender is right: that confirms nothing.
     confirms = is_far or record.reason is not QuarantineReason.FROZEN
     return replace(record, confirmations=record.confirmations + 1) if confirms else record
+
+
+def _with_interval(record: SenderRecord, now_ns: int) -> int:
+    """The smoothed time between two reported positions, with one more."""
+    if record.last_position is None:
+        return record.interval_ns
+    elapsed_ns = max(0, now_ns - record.last_position.stamp_ns)
+    return (record.interval_ns + min(elapsed_ns, LONGEST_PAIR_NS)) // 2
 
 
 def is_in_conflict(record: SenderRecord, began_ns: int) -> bool:

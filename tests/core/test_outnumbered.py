@@ -76,14 +76,14 @@ class Carried:
 
 
 def contested(state: State, by_m: float) -> State:
-    """All teammates in a contest with one that is silent."""
+    """All teammates in a contest with as many that are silent."""
     teammates = state.memory.teammates
-    senders = {
-        name: replace(record, rivals=(Rival("silent", by_m, 0.0),))
-        for name, record in teammates.senders.items()
-    }
+    names = [f"silent {name}" for name in teammates.senders]
+    rivals = tuple(Rival(name, by_m, 0.0) for name in names)
+    senders = {n: replace(record, rivals=rivals) for n, record in teammates.senders.items()}
     silent = SenderRecord(rivals=tuple(Rival(name, -by_m, 0.0) for name in senders))
-    return with_teammates(state, with_senders(teammates, {**senders, "silent": silent}))
+    senders |= dict.fromkeys(names, silent)
+    return with_teammates(state, with_senders(teammates, senders))
 
 
 @pytest.mark.parametrize("observers", [("a", "b"), ("a", "b", "c"), ("a", "b", "c", "d")])

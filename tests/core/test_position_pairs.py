@@ -66,7 +66,8 @@ def drive(
             # The heading of the estimate follows the robot.
             now = now._replace(turn_rad=true.heading - odometry.heading)
             ns = now.stamp_ns
-            known[name] = replace(known[name], last_position=now, last_report_ns=ns)
+            told = {"last_position": now, "last_report_ns": ns, "interval_ns": round(SECOND / hz)}
+            known[name] = replace(known[name], **told)
             known = dict(with_pairs(known, name))
     return known
 
@@ -172,9 +173,7 @@ def test_two_that_report_often_are_not_compared_directly() -> None:
     records = drive({"a": (0.0, 0.0, 0.03), "b": (1.0, 0.0, 0.03)})
     now_ns = records["b"].last_report_ns
     assert set(positions_about(records, "a", now_ns)) == {"b"}
-    often = MeanOffset(0.0, 0.0, Covariance2(1e-4, 0.0, 1e-4))
-    for name in "ab":
-        records = {**records, name: replace(records[name], means=(often, often))}
+    records = {n: replace(record, interval_ns=SECOND // 10) for n, record in records.items()}
     assert positions_about(records, "a", now_ns) == {}
 
 
