@@ -183,9 +183,9 @@ def _quarantine_by_mean(senders: SenderRecords, name: str, now_ns: int) -> Trust
         changed = {**senders, name: quarantined(senders[name], QuarantineReason.HEADING, now_ns)}
         turned = abs(right_turn.rad)
         return TrustDecision(changed, False, "quarantined", frozenset((name,)), 0.0, turned)
-    of = DIRECT if senders[name].means[FAST] is None else FAST
-    mean = mean_of(senders, name, of)
-    means = voting_means(senders, now_ns, name, of)
+    mean, means = mean_of(senders, name, FAST), voting_means(senders, now_ns, name, FAST)
+    if mean is None or not means:  # it, or all others, report too rarely
+        mean, means = mean_of(senders, name, DIRECT), voting_means(senders, now_ns, name, DIRECT)
     if mean is None or not means:
         return TrustDecision(senders, False)
     farthest = max(means.values(), key=lambda other: disagreement(mean, other))

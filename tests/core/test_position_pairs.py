@@ -7,6 +7,7 @@ from collections.abc import Mapping
 import pytest
 from msgspec.structs import replace
 from support.core import SECOND
+from support.trust import AGREES, RULES
 
 from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.geometry import Pose2, step
@@ -21,7 +22,8 @@ from cpcbl_team.sender_differences import (
     with_pairs,
     without_pairs,
 )
-from cpcbl_team.sender_records import QuarantineReason, SenderRecord
+from cpcbl_team.sender_records import QuarantineReason, SenderRecord, TeammateReport
+from cpcbl_team.trust import assess
 
 WHEELS = OdometryErrors(0.1**2, 0.0, 0.1**2, 0.1**2)
 TURNED = 0.7  # the heading of the robot in the field minus that of its odometry, rad
@@ -215,3 +217,21 @@ def test_a_robot_that_was_lost_forgets_its_pairs() -> None:
     records = without_pairs(drive({"a": (0.0, 0.0, 0.03), "b": (0.0, 0.0, 0.03)}))
     assert differences(records, "a") == differences(records, "b") == {}
     assert without_pairs(records) is records
+
+
+def test_one_that_reports_often_is_quarantined_by_two_that_report_rarely() -> None:
+    """These have no mean of offsets that convicts it: it was suspected for ever, and by test 1 it
+    had a correct one quarantined."""
+    often = MeanOffset(0.0, 0.0, Covariance2(1e-4, 0.0, 1e-4))
+    records = drive({"a": (0.0, 0.0, 0.03), "b": (0.0, 0.0, 0.03), "c": (0.5, 0.0, 0.03)})
+    records = {**records, "c": replace(records["c"], means=(often, often))}
+    last = records["c"].last_position
+    assert last is not None
+    for after_s in (0.1, 0.7):
+        now_ns = last.stamp_ns + round(after_s * SECOND)
+        now = TeammateReport(now_ns, AGREES, position=last._replace(stamp_ns=now_ns))
+        decision = assess(records, "c", now, 0, RULES)
+        assert not decision.trusted
+        records = decision.senders
+    assert decision.quarantined == {"c"}
+    assert {name for name, record in records.items() if record.reason} == {"c"}
