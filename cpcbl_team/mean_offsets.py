@@ -49,7 +49,7 @@ class MeanOffset(NamedTuple):
     common_m: float = FAST_COMMON_M  # sigma of an error that never averages away
     stamp_ns: int = 0  # of its last report, and the variance (m^2, both axes) of the estimate then
     estimate_variance: float = 0.0
-    sender: str = ""
+    sender: str = ""  # by which others find their direct difference from it
     apart: Mapping[str, "MeanOffset"] = MappingProxyType({})
     """Its difference from the means of other senders by name, where that was measured directly."""
 
@@ -195,8 +195,9 @@ class FadingOffsets(NamedTuple):
         *,
         least: float = LEAST_REPORTS,
     ) -> MeanOffset | None:
-        """The mean of the reports, if they are enough to determine one. `heading_variance` (rad^2)
-        and `estimate_variance` (m^2, both axes): those of the estimate."""
+        """The mean of the reports, if they are enough to determine one: at least `least`, fading.
+        `heading_variance` (rad^2) and `estimate_variance` (m^2, both axes): those of the
+        estimate."""
         if self.reports < least:
             return None
         (xx, xy, yy), (x, y) = about_position(self.evidence, heading_variance)

@@ -24,22 +24,23 @@ ORIGIN: Final = MeanOffset(0.0, 0.0, Covariance2(LEAST_VARIANCE, 0.0, LEAST_VARI
 """The mean position of a sender, about itself."""
 
 
-def with_pairs(senders: Mapping[str, SenderRecord], name: str) -> dict[str, SenderRecord]:
+def with_pairs(senders: Mapping[str, SenderRecord], name: str) -> Mapping[str, SenderRecord]:
     """The records after the last position that this sender reported was paired with those that
     others reported before. The record of the later name of two has their pairs."""
-    found, now = dict(senders), senders[name].last_position
+    changed, now = dict[str, SenderRecord](), senders[name].last_position
     if now is None or now.stamp_ns != senders[name].last_report_ns:
-        return found
+        return senders
     for other in _partners(senders, name, now.stamp_ns):
         then = senders[other].last_position
         first, later = sorted((name, other))
-        pairs, sign = found[later].pairs, 1.0 if name == later else -1.0
+        record = changed.get(later, senders[later])
+        pairs, sign = record.pairs, 1.0 if name == later else -1.0
         before = pairs.get(first, FadingOffsets())
         sums = before if then is None else with_pair(before, then, now, sign)
         if sums is not before:
             kept = _not_old(pairs, now.stamp_ns)
-            found[later] = replace(found[later], pairs={**kept, first: sums})
-    return found
+            changed[later] = replace(record, pairs={**kept, first: sums})
+    return {**senders, **changed} if changed else senders
 
 
 def _partners(senders: Mapping[str, SenderRecord], name: str, now_ns: int) -> list[str]:

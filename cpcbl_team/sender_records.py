@@ -265,7 +265,7 @@ def _with_position(record: SenderRecord, now: ReportedPosition | None) -> Sender
     then = record.position
     if now is None:
         return record
-    interval_ns = _with_interval(record, now.stamp_ns)
+    interval_ns = _smoothed_interval_ns(record, now.stamp_ns)
     track = with_reported(record.track, now)
     record = replace(record, track=track, last_position=now, interval_ns=interval_ns)
     if then is None or now.stamp_ns - then.stamp_ns > SILENCE_NS:
@@ -293,7 +293,7 @@ def _with_position(record: SenderRecord, now: ReportedPosition | None) -> Sender
     return replace(record, confirmations=record.confirmations + 1) if confirms else record
 
 
-def _with_interval(record: SenderRecord, now_ns: int) -> int:
+def _smoothed_interval_ns(record: SenderRecord, now_ns: int) -> int:
     """The smoothed time between two reported positions, with one more."""
     if record.last_position is None:
         return record.interval_ns

@@ -255,14 +255,14 @@ class TeammateScreen:
         odometry_from_robot = state.odometry_from_robot
         turn_rad = state.estimate.pose.heading - odometry_from_robot.heading
         where = now, observation.x, observation.y, variance, odometry_from_robot, turn_rad
-        noises = position.noise(0.0), position.dependent, state.estimate.covariance.hh
-        known = gaps_of(state), self._odometry_errors, *noises
+        independent, turn_variance = position.noise(0.0), state.estimate.covariance.hh
+        known = gaps_of(state), self._odometry_errors, independent, position.dependent
         report = TeammateReport(
             now,
             None if is_lost or is_guessed else nis,
             (ex, ey),
-            None if is_guessed else ReportedPosition(*where, *known),
-            _evidence_at(state, position.information(noises[0]), position.dependent),
+            None if is_guessed else ReportedPosition(*where, *known, turn_variance),
+            _evidence_at(state, position.information(independent), position.dependent),
             self._is_guest(observation.sender),
             of_heading,
             self.own.nis(state, position),

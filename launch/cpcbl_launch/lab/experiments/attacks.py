@@ -143,7 +143,7 @@ def attack_team(attack: Attack) -> Team:
 
 
 def _at_rate(robot: RobotSettings, attack: Attack) -> RobotSettings:
-    """The robot with a sensor that has so many frames a second."""
+    """The robot with a sensor that has as many frames a second as the attack states."""
     return replace(robot, sensor=replace(robot.sensor, rate_hz=attack.reports_hz))
 
 
