@@ -54,6 +54,19 @@ class Covariance2(NamedTuple):
         )
         return new(Covariance2, turned)
 
+    def with_least_eigenvalue(self, least: float) -> "Covariance2":
+        """With eigenvalues of at least `least` (m^2), and the same eigenvectors."""
+        xx, xy, yy = self
+        mean, half = 0.5 * (xx + yy), math.hypot(0.5 * (xx - yy), xy)
+        smaller, larger = mean - half, mean + half
+        if smaller >= least:
+            return self
+        if larger <= least:
+            return Covariance2(least, 0.0, least)
+        k = (least - smaller) / (larger - smaller)
+        rest, more = 1.0 - k, k * larger
+        return Covariance2(rest * xx + more, rest * xy, rest * yy + more)
+
     def along(self, nx: float, ny: float) -> float:
         """The variance along the unit vector (nx, ny)."""
         xx, xy, yy = self

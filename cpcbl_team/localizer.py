@@ -9,6 +9,7 @@ from typing import Final
 from cpcbl_team.common_error_filter import common_error_filter
 from cpcbl_team.config import CameraSettings, Field, LocalizationSettings
 from cpcbl_team.estimate import Estimate, Scope
+from cpcbl_team.fix_claims import FixClaims
 from cpcbl_team.fixes import PoseObservation, from_fix, from_position_sensor
 from cpcbl_team.fusion import chi_square_bounds, mark_shared
 from cpcbl_team.gate import Gate
@@ -79,10 +80,11 @@ class Localizer:
         field: Field,
         team: frozenset[str] | None = None,
         camera: CameraSettings | None = None,
+        claims: FixClaims | None = None,
     ) -> None:
         """`team`: the robots of the team; every other sender is a guest (None: there are no
         guests). `camera`: that of a robot whose sightings come from its camera; their sigmas do not
-        contain the errors that all of them have in common."""
+        contain the errors that all of them have in common. `claims`: how certain fixes can be."""
         self.settings, self.field, rules = settings, field, settings.localizer
         gates = chi_square_bounds(rules.gate_probability)
         self._rules, self._gates, self._window = rules, gates, rules.lost_window
@@ -101,6 +103,7 @@ class Localizer:
         self.recovery = Recovery(settings, field, self._landmarks, self._variant.reduce)
         common, is_probabilistic = self._common, self._variant.is_probabilistic
         self.screen = TeammateScreen(settings, gates, is_probabilistic, team, common)
+        self._claims = claims if self.screen.is_active else None
         self.landmark_beliefs = LandmarkBeliefs(settings, field, self._common, self.screen)
 
     def cycle(self, state: State, frame: Sightings) -> State:
@@ -268,21 +271,27 @@ class Localizer:
 
     def add_fix(self, state: State, fix: Fix) -> State:
         """Active collaboration: a teammate saw this robot's position, perhaps its heading. The
-        heading is merged after the position, as a measurement of its own."""
-        return self._observe_pose(state, fix.stamp_ns, from_fix(fix))
+        heading is merged after the position, as a measurement of its own. Tests of the fix take the
+        covariance that it states, and the estimate the one that its sender's sensor can have."""
+        stated = used = from_fix(fix)
+        if self._claims is not None:
+            state, used = self._claims.used(state, stated)
+        return self._observe_pose(state, fix.stamp_ns, used, stated)
 
     def add_position(self, state: State, position: Position) -> State:
         """Merges a position of the robot's own sensor. It is like a fix that contains no teammate's
         error."""
         before = self.predict(state, position.stamp_ns)
         observation, prior = from_position_sensor(position), before.estimate
-        state = self._observe_pose(before, position.stamp_ns, observation)
+        state = self._observe_pose(before, position.stamp_ns, observation, observation)
         if self._stationary.is_active and state.updates.accepted > before.updates.accepted:
             evidence = observation.of_position(prior.pose).information()
             state = self._stationary.after_position(state, prior, evidence)
         return state
 
-    def _observe_pose(self, state: State, stamp_ns: int, observation: PoseObservation) -> State:
+    def _observe_pose(
+        self, state: State, stamp_ns: int, observation: PoseObservation, stated: PoseObservation
+    ) -> State:
         state = self._record_observation(self.predict(state, stamp_ns), observation)
         state = state if self._has_map else with_unknown_heading(state)
         updates, prior, source = state.updates, state.estimate, observation.source
@@ -290,11 +299,11 @@ class Localizer:
             return state
         if self._timers.inflates:
             factor = self._timers.inflation(updates, source, stamp_ns)
-            observation = observation.inflated(factor)
-        position = observation.of_position(prior.pose)
+            observation, stated = observation.inflated(factor), stated.inflated(factor)
+        position = stated.of_position(prior.pose)
         nis = position.normalized_innovation_squared(prior.covariance)
         if self.screen.is_active:
-            state, is_trusted = self.screen.screen_observation(state, observation, position, nis)
+            state, is_trusted = self.screen.screen_observation(state, stated, position, nis)
             if not is_trusted or state.estimate is not prior:
                 return self.recovery.check(state)
             observation, nis = self.screen.with_caution(state, observation, nis)

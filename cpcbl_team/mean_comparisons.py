@@ -113,9 +113,11 @@ def _bound(has_evidence: bool, is_of_most: bool = False) -> float:
     return LEAD_ON_MOST if is_of_most else LEAD
 
 
-def compared_with_majority(mean: MeanOffset, others: Means) -> Comparison:
+def compared_with_majority(mean: MeanOffset, others: Means, heard: int = 0) -> Comparison:
     """A sender beside the others. The bias is the distance within which a strict majority of all
-    agrees with it: with three, its own and one more; with four, its own and two more."""
+    agrees with it: with three, its own and one more; with four, its own and two more. It is wrong
+    if the majority of all that were `heard` lately contradicts it: those of the moment may be the
+    liars, while one that would agree with it does not see the robot."""
     count = len(others) + 1
     if count == 1:
         return Comparison()
@@ -126,7 +128,8 @@ def compared_with_majority(mean: MeanOffset, others: Means) -> Comparison:
     accusers = {n: other for n, other in others.items() if apart[n] > CONFLICT}
     if len(others) - len(accusers) >= needed:
         return Comparison(bias, is_confirmed=True)
-    is_wrong = any(2 * (_agreeing(name, accusers) + 1) > count for name in accusers)
+    all_ = max(heard, count)
+    is_wrong = any(2 * (_agreeing(name, accusers) + 1) > all_ for name in accusers)
     return Comparison(bias, is_wrong, not is_wrong)
 
 

@@ -315,7 +315,7 @@ def _result(
     `is_seeing`: the robot has own sensors, although these are not among the others."""
     own, behind = others.get(OWN_SENSORS), record.behind
     if own is None and not is_seeing and not any(name in others for name in behind):
-        return compared_with_majority(mean, others)
+        return compared_with_majority(mean, others, heard)
     of_senders = {name: other for name, other in others.items() if name != OWN_SENSORS}
     return compared_with_own_sensors(mean, own, of_senders, heard, behind)
 

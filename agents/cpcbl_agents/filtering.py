@@ -15,6 +15,7 @@ from cpcbl_agents.agent import (
 )
 from cpcbl_agents.frame_candidates import RobotFrames
 from cpcbl_team.config import CameraSettings, Field, LocalizationSettings
+from cpcbl_team.fix_claims import FixClaims
 from cpcbl_team.frames import FIELD
 from cpcbl_team.inputs import (
     Belief,
@@ -56,11 +57,12 @@ class FilterAgent:
         robot: str = "",
         shared: frozenset[str] = frozenset(),
         frames: RobotFrames | None = None,
+        claims: FixClaims | None = None,
     ) -> None:
         """`camera`: of a robot whose sightings are its camera's. `shared`: the landmarks whose
         places `robot` may tell its teammates, and they it. `frames`: of a team whose frame is
-        agreed."""
-        localizer = Localizer(settings, field, teammates, camera)
+        agreed. `claims`: how certain fixes of the team can be."""
+        localizer = Localizer(settings, field, teammates, camera, claims)
         self.timeline = Timeline(localizer, localizer.start(start_ns))
         self.counts: Counter[str] = Counter()
         self.refused: Counter[tuple[str, str]] = Counter()

@@ -27,6 +27,7 @@ from cpcbl_team.calibration_memory import CalibrationMemory
 from cpcbl_team.common_error_filter import considers_camera
 from cpcbl_team.config import Team
 from cpcbl_team.estimate import Estimate
+from cpcbl_team.fix_claims import FixClaims
 from cpcbl_team.frames import (
     FIELD,
     ORIGIN,
@@ -108,6 +109,7 @@ class Robot:
             robot=name,
             shared=shared,
             frames=frames,
+            claims=FixClaims(team, settings.collaboration.trust),
         )
         self._is_weighted = settings.localizer.variant == "weighted"  # it has no covariance
         self._sightings_input = "frame" if settings.sensing == "camera" else "sightings"

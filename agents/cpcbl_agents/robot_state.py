@@ -4,12 +4,14 @@ import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Literal, NamedTuple, Protocol
 
+from cpcbl_team.fix_claims import OVERCLAIMED
 from cpcbl_team.miscalibration import LEAST_BIAS_RAD, LEAST_SCALE
 from cpcbl_team.misplacements import MISPLACED, MOVES, REJECTED
 from cpcbl_team.moved_landmarks import MOST_MOVES
 from cpcbl_transport.messages import Status, Track
 
 SILENT_S = 2.0  # so long, and three of its pauses, a robot is silent before it is gone
+MOST_OVERCLAIMED = 20  # fixes of one robot that may be so by chance
 TOKEN_LOST_S = 0.5  # a robot that changes its tier may have no token for a moment
 
 Word = Literal["ok", "unconfirmed", "problem", "lost", "gone", "waiting"]
@@ -87,6 +89,7 @@ def _problems(status: Status) -> Iterator[str]:
     yield from status.problems
     if text := distrust_text(status.trust):
         yield text
+    yield from _overclaims(status.counts)
     if text := miscalibration_text(status.counts, status.learned):
         if status.learned is not None:
             distance, turn, bias_rad = status.learned
@@ -94,6 +97,14 @@ def _problems(status: Status) -> Iterator[str]:
         yield f"miscalibrated: {text}"
     for place, text in misplaced_objects(status.counts).items():
         yield f"finds {place} elsewhere than {text}"
+
+
+def _overclaims(counts: Mapping[str, int]) -> Iterator[str]:
+    """`25 fixes of west state less noise than its sensor has by the team file`."""
+    for count, number in counts.items():
+        if count.startswith(OVERCLAIMED) and number >= MOST_OVERCLAIMED:
+            name = count.removeprefix(OVERCLAIMED)
+            yield f"{number} fixes of {name} state less noise than its sensor has by the team file"
 
 
 class Judged(Protocol):

@@ -37,6 +37,9 @@ class TrustSettings(Table, frozen=True, kw_only=True):
     """The pose of a teammate is believed to be no better than this."""
     guest_sigma_m: NotNegative = 0.03
     """The same of a guest that no other source has confirmed yet."""
+    nearest_m: NotNegative = 1.0
+    """A teammate that moves is at least this far from one that it sees: so its sensor settings tell
+    how certain its fixes can be."""
     clock_ahead_s: NotNegative = 0.1
     """Help is refused if the clock of its sender is further ahead than this."""
     clock_behind_s: Positive = 0.4

@@ -54,6 +54,13 @@ def test_each_state_has_its_word_its_reasons_and_its_severity(
     assert bool(found.why) is (word != "ok")
 
 
+def test_fixes_that_state_too_little_noise_are_a_problem_if_they_are_many() -> None:
+    text = "20 fixes of west state less noise than its sensor has by the team file"
+    for number, problems in ((19, ()), (20, (text,))):
+        found = robot_state(latest(counts={"overclaimed_west": number}))
+        assert found.problems == problems
+
+
 def test_what_a_robot_says_of_teammates_calibration_and_map_is_a_problem() -> None:
     counts = {**MISCALIBRATED, "misplaced_door": 520, "rejected_door": 14}
     found = robot_state(latest(trust=(Trust("west", "biased"),), counts=counts))

@@ -196,6 +196,15 @@ def test_a_strict_majority_convicts_and_half_does_not() -> None:
     assert results(at(0.0)) == ["right"]
 
 
+def test_those_of_the_moment_convict_nobody_against_most_that_were_heard_lately() -> None:
+    """Two liars beside one correct sender, while the other correct one does not see the robot."""
+    correct, others = at(0.5), {"a": at(0.0), "b": at(0.0)}
+    for heard, is_wrong in ((0, True), (3, True), (4, False)):
+        comparison = compared_with_majority(correct, others, heard)
+        assert (comparison.is_wrong, comparison.is_contested) == (is_wrong, not is_wrong)
+    assert compared_with_majority(at(0.0), {"a": at(0.0), "b": correct}, 4).is_confirmed
+
+
 def test_three_that_all_disagree_convict_nobody() -> None:
     assert results(at(0.0), at(0.5), at(1.0)) == ["contested"] * 3
 
