@@ -42,6 +42,8 @@ from cpcbl_team.sender_records import (
 )
 
 FADING_NS: Final = 500_000_000  # time constant of these sums: the estimate may move fast
+FADING_REPORTS: Final = 5  # of a source that reports more rarely: one report alone decides nothing,
+MOST_FADING_NS: Final = 2_500_000_000  # but old ones neither
 LEAST_UNITED: Final = 2  # teammates that contradict the estimate together
 
 
@@ -91,7 +93,8 @@ def with_denial(
     total = 0.0
     if before is not None and is_same:
         elapsed_ns = report.stamp_ns - before.stamp_ns
-        total = before.chi_square * math.exp(-max(elapsed_ns, 0) / FADING_NS)
+        of_reports = min(FADING_REPORTS * record.interval_ns, MOST_FADING_NS)
+        total = before.chi_square * math.exp(-max(elapsed_ns, 0) / max(of_reports, FADING_NS))
     total += _denied_by(evidence, *senders[dissenter].mean_offset)
     return replace(record, denial=Denial(dissenter, since_ns, total, report.stamp_ns))
 

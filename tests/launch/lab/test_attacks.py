@@ -157,6 +157,26 @@ def test_without_a_majority_sigma_holds_where_all_report_twice_a_second() -> Non
 
 
 @pytest.mark.thorough
+def test_a_fix_that_states_less_than_its_sensor_can_do_carries_no_robot_off() -> None:
+    """Beside observers with a usual sensor a liar of a centimetre outweighed both: 69 % inside 3
+    sigma, NEES 6.9."""
+    _, row = rows_of([EVERY["overclaimed, 5 %", "scout"]], [1])
+    assert row.held
+    assert row.noticed == 1
+    assert row.least_inside_3_sigma > 0.97
+    assert row.false_quarantines == 0
+
+
+@pytest.mark.thorough
+def test_two_liars_are_no_majority_beside_observers_that_see_the_robot_in_turn() -> None:
+    """Both correct ones were in quarantine, and nobody said so: 16 % inside 3 sigma, NEES 96."""
+    _, row = rows_of([EVERY["no majority, 5 %", "scout"]], [1])
+    assert row.held
+    assert row.worst_nees < 3.0
+    assert row.false_quarantines == 0
+
+
+@pytest.mark.thorough
 def test_the_runs_to_compare_with_have_no_liar(short: dict[tuple[str, str], AttackRow]) -> None:
     for key in (("", "scout"), ("", "navigator")):
         assert short[key].worst_ratio == 1.0
@@ -184,8 +204,8 @@ def test_the_table_says_which_aims_are_missed(
 @pytest.mark.timeout(7200)
 def test_every_aim_but_those_of_poor_eyes_holds_in_twenty_seeds() -> None:
     """Two liars of four mislead a navigator for some seconds (docs/trust.md)."""
-    often = [attack for attack in attacks.attacks() if attack.reports_hz == USUAL_HZ]
-    rows = rows_of(often, range(3000, 3020))
+    usual = [a for a in attacks.attacks() if a.reports_hz == USUAL_HZ and a.has_good_observers]
+    rows = rows_of(usual, range(3000, 3020))
     missed = [(row.attack.name, row.attack.victim) for row in rows if not row.held]
     missed_by_poor_eyes = {(name, "navigator") for name in ("drift", "overclaimed", "sleeper")}
     assert set(missed) <= missed_by_poor_eyes
@@ -205,7 +225,7 @@ def test_two_liars_are_no_majority_while_a_correct_observer_does_not_see_the_nav
 def test_two_liars_of_four_mislead_no_robot_with_eyes_for_long() -> None:
     """Own readings decide between two sides that the estimate follows both."""
     _, row = rows_of([EVERY["overclaimed", "navigator"]], [1])
-    assert row.held  # 1.57 before
+    assert row.worst_ratio < 1.4  # 1.57 before
     assert row.least_inside_3_sigma > 0.97
     assert row.false_quarantines == 0
 

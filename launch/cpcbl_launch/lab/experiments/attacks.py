@@ -37,7 +37,8 @@ ONE_AXIS = "one-axis:0.02,0.005,0.25"  # 2 cm/s in x, where it states 5 mm, and 
 LEAST_INSIDE = 0.95  # of the victim's samples within 3 sigma, where nobody can find the liars
 OWN_EYES_RATIO, BLIND_RATIO = 1.3, 1.5
 RARE_HZ = 2.0
-OF_RARE_REPORTS = "drift", "overclaimed", "echo", "no majority"
+OF_OTHER_TEAMS = "drift", "overclaimed", "echo", "no majority"
+USUAL_SENSOR = {"range_share": 0.05, "range_floor_m": 0.02, "bearing_sigma_deg": 3.0}
 NAVIGATOR = {"victim": "navigator", "most_ratio": OWN_EYES_RATIO}
 
 
@@ -55,6 +56,9 @@ class Attack(Struct, frozen=True, kw_only=True):
     honest: tuple[str, ...] = HONEST  # correct observers
     renamed_every_s: float | None = None  # liars come back under another name so often
     reports_hz: float = USUAL_HZ  # of all sensors, and of the liars
+    has_good_observers: bool = (
+        True  # else with the usual sensor of a robot; so are the liars' posts
+    )
     from_s: float = 10.0
     end_s: float = 70.0
 
@@ -116,12 +120,9 @@ def attacks() -> tuple[Attack, ...]:
         replace(renamed, name="new names, one robot", liars=GUESTS, honest=("north",)),
         replace(sudden, name="guests, one robot", liars=GUESTS, honest=("north",), most_ratio=None),
     ]
-    rare = {"reports_hz": RARE_HZ}
-    cases += [
-        replace(case, name=f"{case.name}, {RARE_HZ:g} Hz", **rare)
-        for case in cases
-        if case.name in OF_RARE_REPORTS
-    ]
+    chosen = [case for case in cases if case.name in OF_OTHER_TEAMS]
+    cases += [replace(c, name=f"{c.name}, {RARE_HZ:g} Hz", reports_hz=RARE_HZ) for c in chosen]
+    cases += [replace(c, name=f"{c.name}, 5 %", has_good_observers=False) for c in chosen]
     return tuple(replace(case, lie=case.lie.format(victim=case.victim)) for case in cases)
 
 
@@ -139,12 +140,14 @@ def attack_team(attack: Attack) -> Team:
     assert west.start is not None
     start = replace(west.start, x_m=9.0, heading_deg=180.0)
     robots = {**team.robots, "east": replace(west, start=start)}
-    return replace(team, robots={n: _at_rate(r, attack) for n, r in robots.items() if n in kept})
+    return replace(team, robots={n: _equipped(r, attack) for n, r in robots.items() if n in kept})
 
 
-def _at_rate(robot: RobotSettings, attack: Attack) -> RobotSettings:
-    """The robot with a sensor that has as many frames a second as the attack states."""
-    return replace(robot, sensor=replace(robot.sensor, rate_hz=attack.reports_hz))
+def _equipped(robot: RobotSettings, attack: Attack) -> RobotSettings:
+    """The robot with the sensor that it has in this attack."""
+    is_usual = not (attack.has_good_observers or robot.odometry.moves)
+    sensor = replace(robot.sensor, **(USUAL_SENSOR if is_usual else {}))
+    return replace(robot, sensor=replace(sensor, rate_hz=attack.reports_hz))
 
 
 def run_attack(attack: Attack, seed: int) -> AttackRun:
@@ -230,7 +233,8 @@ def attack_tables(rows: Sequence[AttackRow], seeds: int) -> Iterable[RenderableT
     yield (
         "A scout has one liar beside two correct observers, a navigator two (but one\n"
         "guest); without a majority a scout has two. Where guests lie there are five, twice\n"
-        "beside one correct observer. Column m is the median RMSE; worst\n"
+        "beside one correct observer. Where reports are rare all sensors and liars have 2 Hz;\n"
+        "with 5 % the observers have a usual sensor (and 3°). Column m is the median RMSE; worst\n"
         "is the largest ratio of a seed to the same seed without liars. The aim is at most\n"
         f"{BLIND_RATIO:g} for a scout and {OWN_EYES_RATIO:g} for a navigator; "
         "without a majority σ has to hold.\n"
@@ -264,4 +268,6 @@ def _title(attack: Attack) -> str:
         return attack.name
     if attack.reports_hz != USUAL_HZ:
         return f"no liar, {attack.reports_hz:g} Hz"
+    if not attack.has_good_observers:
+        return "no liar, 5 %"
     return "no liar" if attack.end_s < 100.0 else "later"
