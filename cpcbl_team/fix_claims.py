@@ -20,6 +20,8 @@ OVERCLAIMED: Final = "overclaimed_"
 """The count of fixes of a robot that state less than its sensor can do begins with this."""
 CORRECT_SHARE: Final = 0.8
 """Of the sensor's sigma: correct fixes state at least so much, for their distances are noisy."""
+CLEARLY: Final = 10.0
+"""The ratio of determinants (m^4) of a claim that no error of the line of sight explains."""
 SIGMAS: Final = 3.0  # by which a robot may be nearer than its stated start
 
 
@@ -39,10 +41,11 @@ class FixClaims:
         self._nearest_m = rules.nearest_m
 
     def used(self, state: State, stated: PoseObservation) -> tuple[State, PoseObservation]:
-        """A fix as the estimate may use it. It is counted if it states less than the sensor of an
-        observer can do that stands; one that moves may be nearer."""
+        """A fix as the estimate may use it. It is counted if it states far less than the sensor of
+        an observer can do that stands; one that moves may be nearer."""
         believed = self.believed(stated)
-        if believed is not stated and self._observers[stated.sender].place is not None:
+        least = CLEARLY * stated.sensor.determinant()
+        if believed.sensor.determinant() > least and self._observers[stated.sender].place:
             state = state.counted(OVERCLAIMED + stated.sender)
         return state, believed
 

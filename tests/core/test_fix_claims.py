@@ -138,6 +138,19 @@ def test_only_an_observer_that_stands_is_said_to_state_too_little() -> None:
         assert sum(state.counts.values()) == number
 
 
+@given(noise=st.floats(-3.0, 3.0))
+def test_a_sensor_with_precise_ranges_and_poor_bearings_is_not_said_to_state_too_little(
+    noise: float,
+) -> None:
+    """The line of sight to the reading is another one than that of the fix's covariance."""
+    poor = SensorSettings(range_share=0.01, range_floor_m=0.005, bearing_sigma_deg=5.0)
+    robot = Localizer(LocalizationSettings(start=Start(x_m=1.0, y_m=5.0)), Field())
+    sensor = oriented_covariance(0.03, 0.26, 0.5 * math.pi + noise * math.radians(5.0))
+    seen = from_fix(fix())._replace(sensor=sensor)
+    state, _ = claims(observer=replace(STANDS, sensor=poor)).used(robot.start(0), seen)
+    assert not state.counts
+
+
 @given(sigmas, sigmas, angles, sigmas, sigmas, angles)
 def test_the_larger_of_two_covariances(
     a: float, b: float, turn: float, along: float, across: float, angle: float
