@@ -75,7 +75,7 @@ USUAL = {
     "trust.readmit_s": Usual(0.0, 600.0, TIME),
     "trust.least_sigma_m": Usual(0.0, 1.0, LENGTH),
     "trust.guest_sigma_m": Usual(0.0, 1.0, LENGTH),
-    "trust.nearest_m": Usual(0.0, 100.0, LENGTH),
+    "trust.nearest_m": Usual(0.02, 50.0, LENGTH),
     "trust.clock_ahead_s": Usual(0.0, 10.0, TIME),
     "trust.clock_behind_s": Usual(0.005, 10.0, TIME),
     "collaboration.max_age_s": Usual(0.05, 60.0, TIME),
