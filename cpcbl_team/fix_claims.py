@@ -21,7 +21,7 @@ OVERCLAIMED: Final = "overclaimed_"
 CORRECT_SHARE: Final = 0.8
 """Of the sensor's sigma: correct fixes state at least so much, for their distances are noisy."""
 CLEARLY: Final = 10.0
-"""The ratio of determinants (m^4) of a claim that no error of the line of sight explains."""
+"""The ratio of determinants that no error of the line of sight explains."""
 SIGMAS: Final = 3.0  # by which a robot may be nearer than its stated start
 
 
@@ -44,10 +44,10 @@ class FixClaims:
         """A fix as the estimate may use it. It is counted if it states far less than the sensor of
         an observer can do that stands; one that moves may be nearer."""
         believed = self.believed(stated)
-        least = CLEARLY * stated.sensor.determinant()
-        if believed.sensor.determinant() > least and self._observers[stated.sender].place:
-            state = state.counted(OVERCLAIMED + stated.sender)
-        return state, believed
+        if believed is stated or self._observers[stated.sender].place is None:
+            return state, believed
+        is_clear = believed.sensor.determinant() > CLEARLY * stated.sensor.determinant()
+        return state.counted(OVERCLAIMED + stated.sender) if is_clear else state, believed
 
     def believed(self, seen: PoseObservation) -> PoseObservation:
         """A fix, with a sensor's part of its covariance that its observer's sensor can have."""

@@ -56,9 +56,7 @@ class Attack(Struct, frozen=True, kw_only=True):
     honest: tuple[str, ...] = HONEST  # correct observers
     renamed_every_s: float | None = None  # liars come back under another name so often
     reports_hz: float = USUAL_HZ  # of all sensors, and of the liars
-    has_good_observers: bool = (
-        True  # else with the usual sensor of a robot; so are the liars' posts
-    )
+    has_good_observers: bool = True  # else all observers have the usual sensor of a robot
     from_s: float = 10.0
     end_s: float = 70.0
 
