@@ -20,9 +20,9 @@ OVERCLAIMED: Final = "overclaimed_"
 """The count of fixes of a robot that state less than its sensor can do begins with this."""
 CORRECT_SHARE: Final = 0.8
 """Of the sensor's sigma: correct fixes state at least so much, for their distances are noisy."""
-CLEARLY: Final = 10.0
-"""The ratio of determinants that no error of the line of sight explains."""
-SIGMAS: Final = 3.0  # by which a robot may be nearer than its stated start
+CLEAR_RATIO: Final = 10.0
+"""Of the determinants of the used and the stated covariance, by which a fix clearly overclaims."""
+START_SIGMAS: Final = 3.0  # by which an observer may be nearer than its stated start
 
 
 class _Observer(NamedTuple):
@@ -46,22 +46,24 @@ class FixClaims:
         believed = self.believed(stated)
         if believed is stated or self._observers[stated.sender].place is None:
             return state, believed
-        is_clear = believed.sensor.determinant() > CLEARLY * stated.sensor.determinant()
+        is_clear = believed.sensor.determinant() > CLEAR_RATIO * stated.sensor.determinant()
         return state.counted(OVERCLAIMED + stated.sender) if is_clear else state, believed
 
     def believed(self, seen: PoseObservation) -> PoseObservation:
-        """A fix, with a sensor's part of its covariance that its observer's sensor can have."""
+        """A fix, with the sensor's part of its covariance raised to what its observer's sensor can
+        do."""
         observer = self._observers.get(seen.sender)
         if observer is None:
             return seen
         sensor, place = observer
-        distance_m, angle = self._nearest_m, None
+        distance_m, angle = self._nearest_m, None  # the line of sight may have any direction
         if place is not None:
             dx, dy = seen.x - place.x_m, seen.y - place.y_m
-            distance_m, angle = max(0.0, hypot(dx, dy) - SIGMAS * place.sigma_m), atan2(dy, dx)
+            distance_m = max(0.0, hypot(dx, dy) - START_SIGMAS * place.sigma_m)
+            angle = atan2(dy, dx)
         along_m = CORRECT_SHARE * range_sigma_m(sensor, distance_m)
         across_m = CORRECT_SHARE * distance_m * width_per_m(sensor.bearing_sigma_rad)
-        if angle is None:  # the line of sight may have any direction
+        if angle is None:
             along_m = across_m = min(along_m, across_m)
         covariance = at_least(seen.sensor, along_m, across_m, angle or 0.0)
         return seen if covariance is seen.sensor else seen._replace(sensor=covariance)

@@ -54,11 +54,16 @@ class Covariance2(NamedTuple):
         )
         return new(Covariance2, turned)
 
+    def eigenvalues(self) -> tuple[float, float]:
+        """The variances along the minor and the major axis (m^2)."""
+        xx, xy, yy = self
+        mean, half = 0.5 * (xx + yy), math.hypot(0.5 * (xx - yy), xy)
+        return mean - half, mean + half
+
     def with_least_eigenvalue(self, least: float) -> "Covariance2":
         """With eigenvalues of at least `least` (m^2), and the same eigenvectors."""
         xx, xy, yy = self
-        mean, half = 0.5 * (xx + yy), math.hypot(0.5 * (xx - yy), xy)
-        smaller, larger = mean - half, mean + half
+        smaller, larger = self.eigenvalues()
         if smaller >= least:
             return self
         if larger <= least:

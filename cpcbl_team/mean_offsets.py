@@ -71,9 +71,8 @@ class MeanOffset(NamedTuple):
         """Whether it is certain enough along any axis for others to contradict it: the smaller
         eigenvalue of its covariance. One that is vague along the other axis has no vote, for it
         would agree with anybody there, but as much weight along this one."""
-        xx, xy, yy = self.covariance
-        least = 0.5 * (xx + yy) - math.hypot(0.5 * (xx - yy), xy)
-        return least <= MOST_SIGMA_M * MOST_SIGMA_M
+        smaller, _ = self.covariance.eigenvalues()
+        return smaller <= MOST_SIGMA_M * MOST_SIGMA_M
 
 
 def about_position(evidence: Sums, heading_variance: float) -> tuple[Covariance2, Offset]:

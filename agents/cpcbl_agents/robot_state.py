@@ -11,7 +11,7 @@ from cpcbl_team.moved_landmarks import MOST_MOVES
 from cpcbl_transport.messages import Status, Track
 
 SILENT_S = 2.0  # so long, and three of its pauses, a robot is silent before it is gone
-MOST_OVERCLAIMED = 20  # fixes of one robot that may be so by chance
+LEAST_OVERCLAIMED = 20  # fixes of one robot that are no chance
 TOKEN_LOST_S = 0.5  # a robot that changes its tier may have no token for a moment
 
 Word = Literal["ok", "unconfirmed", "problem", "lost", "gone", "waiting"]
@@ -102,7 +102,7 @@ def _problems(status: Status) -> Iterator[str]:
 def _overclaims(counts: Mapping[str, int]) -> Iterator[str]:
     """`25 fixes of west state less noise than its sensor has by the team file`."""
     for count, number in counts.items():
-        if count.startswith(OVERCLAIMED) and number >= MOST_OVERCLAIMED:
+        if count.startswith(OVERCLAIMED) and number >= LEAST_OVERCLAIMED:
             name = count.removeprefix(OVERCLAIMED)
             yield f"{number} fixes of {name} state less noise than its sensor has by the team file"
 

@@ -38,8 +38,8 @@ class TrustSettings(Table, frozen=True, kw_only=True):
     guest_sigma_m: NotNegative = 0.03
     """The same of a guest that no other source has confirmed yet."""
     nearest_m: NotNegative = 1.0
-    """A teammate that moves is at least this far from one that it sees: so its sensor settings tell
-    how certain its fixes can be."""
+    """A teammate that moves is taken to be at least this far from a robot that it sees. Its sensor
+    settings and this distance bound the certainty of its fixes. 0: they are not bounded."""
     clock_ahead_s: NotNegative = 0.1
     """Help is refused if the clock of its sender is further ahead than this."""
     clock_behind_s: Positive = 0.4

@@ -1,4 +1,5 @@
-"""A faulty robot on a real log (docs/trust.md): what it does to each robot, with and without trust.
+"""A faulty robot on a real log (docs/attacks.md): what it does to each robot, with and without
+trust.
 
     PYTHONPATH=.:agents:transport:launch:tests python -m benchmarks.faulty_log MRCLAM6 \
         --blind 3,4,5 --robot 1 --fault bias:1,1@300-600

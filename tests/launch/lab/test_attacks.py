@@ -203,7 +203,7 @@ def test_the_table_says_which_aims_are_missed(
 @pytest.mark.long
 @pytest.mark.timeout(7200)
 def test_every_aim_but_those_of_poor_eyes_holds_in_twenty_seeds() -> None:
-    """Two liars of four mislead a navigator for some seconds (docs/trust.md)."""
+    """Two liars of four mislead a navigator for some seconds (docs/attacks.md)."""
     usual = [a for a in attacks.attacks() if a.reports_hz == USUAL_HZ and a.has_good_observers]
     rows = rows_of(usual, range(3000, 3020))
     missed = [(row.attack.name, row.attack.victim) for row in rows if not row.held]

@@ -71,4 +71,4 @@ def test_a_robot_that_sees_landmarks_is_not_harmed_by_a_liar() -> None:
     lied_s = log.start_ns * 1e-9 + 300.0
     figures = score(recorder.samples("2", log.truth["2"], from_s=lied_s))
     assert figures.position_rmse_m is not None
-    assert figures.position_rmse_m < 0.1  # 0.07 m where it believes all, too: docs/trust.md
+    assert figures.position_rmse_m < 0.1  # 0.07 m where it believes all, too: docs/attacks.md

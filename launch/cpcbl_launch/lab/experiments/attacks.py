@@ -37,7 +37,7 @@ ONE_AXIS = "one-axis:0.02,0.005,0.25"  # 2 cm/s in x, where it states 5 mm, and 
 LEAST_INSIDE = 0.95  # of the victim's samples within 3 sigma, where nobody can find the liars
 OWN_EYES_RATIO, BLIND_RATIO = 1.3, 1.5
 RARE_HZ = 2.0
-OF_OTHER_TEAMS = "drift", "overclaimed", "echo", "no majority"
+IN_OTHER_TEAMS = "drift", "overclaimed", "echo", "no majority"
 USUAL_SENSOR = {"range_share": 0.05, "range_floor_m": 0.02, "bearing_sigma_deg": 3.0}
 NAVIGATOR = {"victim": "navigator", "most_ratio": OWN_EYES_RATIO}
 
@@ -118,7 +118,7 @@ def attacks() -> tuple[Attack, ...]:
         replace(renamed, name="new names, one robot", liars=GUESTS, honest=("north",)),
         replace(sudden, name="guests, one robot", liars=GUESTS, honest=("north",), most_ratio=None),
     ]
-    chosen = [case for case in cases if case.name in OF_OTHER_TEAMS]
+    chosen = [case for case in cases if case.name in IN_OTHER_TEAMS]
     cases += [replace(c, name=f"{c.name}, {RARE_HZ:g} Hz", reports_hz=RARE_HZ) for c in chosen]
     cases += [replace(c, name=f"{c.name}, 5 %", has_good_observers=False) for c in chosen]
     return tuple(replace(case, lie=case.lie.format(victim=case.victim)) for case in cases)
@@ -231,8 +231,9 @@ def attack_tables(rows: Sequence[AttackRow], seeds: int) -> Iterable[RenderableT
     yield (
         "A scout has one liar beside two correct observers, a navigator two (but one\n"
         "guest); without a majority a scout has two. Where guests lie there are five, twice\n"
-        "beside one correct observer. Where reports are rare all sensors and liars have 2 Hz;\n"
-        "with 5 % the observers have a usual sensor (and 3°). Column m is the median RMSE; worst\n"
+        "beside one correct observer. In rows with 2 Hz all sensors and liars report so\n"
+        "often; in rows with 5 % the observers have a usual sensor (5 % and 3°).\n"
+        "Column m is the median RMSE; worst\n"
         "is the largest ratio of a seed to the same seed without liars. The aim is at most\n"
         f"{BLIND_RATIO:g} for a scout and {OWN_EYES_RATIO:g} for a navigator; "
         "without a majority σ has to hold.\n"
