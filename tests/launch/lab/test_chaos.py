@@ -32,7 +32,6 @@ from cpcbl_launch.lab.chaos.links import (
 )
 from cpcbl_launch.lab.chaos.runner import (
     print_faults,
-    run_scenario,
     run_scenarios,
     select_scenarios,
 )
@@ -63,9 +62,10 @@ SETTING = ScenarioOptions(seed=3)
 
 
 def assert_checks_met(outcome: Outcome) -> None:
-    """Fails with all figures; skips a scenario whose requirements are missing."""
-    if outcome.not_run:
-        pytest.skip(outcome.not_run)
+    """Fails with all figures; skips a scenario whose requirements are missing, or that a busy
+    machine left without a verdict (`make chaos` judges it)."""
+    if missing := outcome.not_run or outcome.not_judged:
+        pytest.skip(missing)
     seen = "\n".join(f"{'held' if c.is_met else 'NOT HELD'}: {c}" for c in outcome.checks)
     assert outcome.is_met, f"{outcome.failed}\n{seen}"
 
@@ -82,7 +82,8 @@ def assert_checks_met(outcome: Outcome) -> None:
     ],
 )
 def test_the_checks_of_a_quick_scenario_are_met(scenario: Scenario) -> None:
-    assert_checks_met(run_scenario(scenario, SETTING))
+    report = run_scenarios([scenario], SETTING, lambda _: lambda _: None, lambda _: None, retries=1)
+    assert_checks_met(report.outcomes[0])
 
 
 # The table and its command ------------------------------------------------------------------------
