@@ -10,15 +10,12 @@ its position is as uncertain as that mixture.
 import math
 from typing import Final, NamedTuple
 
+from cpcbl_team.contests import open_rivals
 from cpcbl_team.estimate import Covariance3, Estimate
 from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.mean_offsets import ALTERNATING_NS, FAST, bias_variance
-from cpcbl_team.sender_comparisons import (
-    SenderRecords,
-    open_rivals,
-    recent_senders,
-)
 from cpcbl_team.sender_records import NEVER_NS, NO_EVIDENCE, OWN_SENSORS, Rival
+from cpcbl_team.voters import SenderRecords, recent_senders
 
 MOST_BEHIND: Final = 20.0  # a difference of chi-squares beyond which a side has no weight
 CLEAR: Final = 0.73  # of the more likely side, by a difference of chi-squares of 2

@@ -24,12 +24,6 @@ from cpcbl_team.mean_offsets import (
     lead,
 )
 from cpcbl_team.reported_tracks import ReportedPosition
-from cpcbl_team.sender_comparisons import (
-    SenderRecords,
-    members,
-    recent_senders,
-    votes,
-)
 from cpcbl_team.sender_records import (
     JUMP_SIGMAS,
     OWN_SENSORS,
@@ -40,6 +34,7 @@ from cpcbl_team.sender_records import (
     TeammateReport,
     distances_between,
 )
+from cpcbl_team.voters import SenderRecords, members, recent_senders, votes
 
 FADING_NS: Final = 500_000_000  # time constant of these sums: the estimate may move fast
 FADING_REPORTS: Final = 5  # of a source that reports more rarely: one report alone decides nothing,

@@ -39,6 +39,7 @@ class FixClaims:
         has_places = not team.map.is_frame_agreed  # in the frame of the fixes
         self._observers = {n: _observer(r, has_places) for n, r in robots.items()}
         self._nearest_m = rules.nearest_m
+        self.relays = frozenset(n for n, r in team.robots.items() if _is_relay(r))
 
     def used(self, state: State, stated: PoseObservation) -> tuple[State, PoseObservation]:
         """A fix as the estimate may use it. It is counted if it states far less than the sensor of
@@ -67,6 +68,12 @@ class FixClaims:
             along_m = across_m = min(along_m, across_m)
         covariance = at_least(seen.sensor, along_m, across_m, angle or 0.0)
         return seen if covariance is seen.sensor else seen._replace(sensor=covariance)
+
+
+def _is_relay(robot: RobotSettings) -> bool:
+    """Whether a robot that has driven for a while knows its place only by what others tell it."""
+    has_own = robot.sensor.sees_landmarks or robot.position_sensor is not None
+    return robot.odometry.moves and not has_own
 
 
 def _observer(robot: RobotSettings, has_place: bool) -> _Observer:

@@ -19,7 +19,6 @@ from cpcbl_team.compromises import FRESH_NS, compromise
 from cpcbl_team.fixes import PoseObservation
 from cpcbl_team.fusion import mark_shared
 from cpcbl_team.own_pose import NO_HYPOTHESES, OwnPose
-from cpcbl_team.sender_comparisons import SenderRecords, reporting_senders
 from cpcbl_team.sender_records import (
     BY_COMPARISON,
     NEVER_NS,
@@ -28,6 +27,7 @@ from cpcbl_team.sender_records import (
     SenderRecord,
 )
 from cpcbl_team.state import State
+from cpcbl_team.voters import SenderRecords, reporting_senders
 
 FADING_NS: Final = 20_000_000_000  # time constant with which evidence fades
 HELD_NS: Final = 10_000_000_000  # hypotheses are kept for so long after the last contradiction

@@ -26,7 +26,6 @@ from cpcbl_team.own_pose import OwnPose
 from cpcbl_team.own_pose_conflicts import own_pose_conflict
 from cpcbl_team.parameters import Sensitivity, sensitivity_dot
 from cpcbl_team.recovery_evidence import without_senders
-from cpcbl_team.sender_comparisons import SenderRecords
 from cpcbl_team.sender_records import (
     BY_COMPARISON,
     CONTRADICTING_NIS,
@@ -44,6 +43,7 @@ from cpcbl_team.state import (
     with_teammates,
 )
 from cpcbl_team.trust import reset_scores
+from cpcbl_team.voters import SenderRecords
 
 GUESSED_NS: Final = 100_000_000  # odometry that is missing for longer does not only come late
 

@@ -9,14 +9,10 @@ import math
 from collections.abc import Collection, Iterator
 from typing import Final
 
+from cpcbl_team.contests import open_rivals
 from cpcbl_team.mean_offsets import CONFLICT, FAST, disagreement
-from cpcbl_team.sender_comparisons import (
-    SenderRecords,
-    open_rivals,
-    reporting_senders,
-    votes,
-)
 from cpcbl_team.sender_records import BY_COMPARISON, OWN_SENSORS
+from cpcbl_team.voters import SenderRecords, reporting_senders, votes
 
 ALIKE_M: Final = 0.05  # two senders whose offsets differ by no more, or by half of them, agree
 OVERTURNED_NS: Final = 20_000_000_000  # an older quarantine is not overturned

@@ -9,8 +9,8 @@ from typing import NamedTuple
 
 from cpcbl_team.mean_comparisons import CONFLICT_OF_MOST, EVIDENCE
 from cpcbl_team.mean_offsets import CONFLICT, USUAL
-from cpcbl_team.sender_comparisons import SenderRecords, recent_senders
 from cpcbl_team.sender_records import CONTRADICTING_NIS, OWN_SENSORS, SILENCE_NS, SenderRecord
+from cpcbl_team.voters import SenderRecords, recent_senders
 
 
 class OwnPoseConflict(NamedTuple):

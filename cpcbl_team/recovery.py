@@ -10,6 +10,7 @@ from typing import Final
 
 from cpcbl_team.calibration_filter import DETERMINED
 from cpcbl_team.config import Field, LocalizationSettings
+from cpcbl_team.contests import contest_m
 from cpcbl_team.contradictions import contradicts, kept_at_trusted_pose
 from cpcbl_team.disputes import united_majority
 from cpcbl_team.estimate import Estimate
@@ -33,7 +34,6 @@ from cpcbl_team.miscalibration import (
 )
 from cpcbl_team.recovery_evidence import WINDOW_NS, latest
 from cpcbl_team.relocalization import are_apart, readings_of, relocalize
-from cpcbl_team.sender_comparisons import SenderRecords, contest_m
 from cpcbl_team.sender_differences import without_pairs
 from cpcbl_team.sensor_mistakes import (
     MIRRORED,
@@ -58,6 +58,7 @@ from cpcbl_team.trusted_pose import (
     trusted_pose,
     with_jump,
 )
+from cpcbl_team.voters import SenderRecords
 
 INFLATION_NS: Final = 1_000_000_000
 DOUBT_NS: Final = 5_000_000_000  # wrong inputs are named before they move a robot elsewhere

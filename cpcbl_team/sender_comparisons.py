@@ -7,13 +7,12 @@ decided. A party that is silent meanwhile is counted as if it still said what it
 its rival says that the robot is.
 """
 
-import math
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Mapping
 from functools import reduce
-from typing import Final
 
 from msgspec.structs import replace
 
+from cpcbl_team.contests import contradicted_before, open_rivals, without_ended_contests
 from cpcbl_team.mean_comparisons import (
     Comparison,
     both,
@@ -40,93 +39,14 @@ from cpcbl_team.sender_records import (
     SenderRecord,
     with_loud_track,
 )
-
-RECENT_NS: Final = 3_000_000_000  # a sender takes part in disputes for so long after a report
-LEAST_CONFIRMED: Final = 20  # reports of a guest with which others agreed, until it is proven
-DOUBT_NS: Final = 60_000_000_000  # for so long new guests have the doubt about earlier ones
-SenderRecords = Mapping[str, SenderRecord]
-
-
-def reporting_senders(senders: SenderRecords, now_ns: int) -> SenderRecords:
-    """The senders that reported recently, those in quarantine too."""
-    return {n: r for n, r in senders.items() if _is_reporting(r, now_ns)}
-
-
-def recent_senders(
-    senders: SenderRecords, now_ns: int, without: str | None = None
-) -> Iterator[tuple[str, SenderRecord]]:
-    """The senders out of quarantine that reported recently."""
-    for name, r in senders.items():
-        if name != without and not r.reason and _is_reporting(r, now_ns):
-            yield name, r
-
-
-def _is_reporting(record: SenderRecord, now_ns: int) -> bool:
-    return now_ns - record.last_report_ns <= RECENT_NS
-
-
-def senders_with_a_say(senders: SenderRecords, name: str, now_ns: int) -> SenderRecords:
-    """The recent senders that count in a dispute about a report of `name`."""
-    silenced = {*doubted_guests(senders, now_ns)} - {name}
-    return {n: r for n, r in recent_senders(senders, now_ns) if n not in silenced}
-
-
-def members(senders: SenderRecords, names: Collection[str]) -> list[str]:
-    """The robots of the team among these senders, without guests."""
-    return [name for name in names if not senders[name].is_guest]
-
-
-def votes(senders: SenderRecords, side: Collection[str], sides: Collection[str]) -> int:
-    """The votes of one side of a dispute between all `sides`. Anybody may come as several guests:
-    beside two robots of the team they have no vote, and beside one they have one together."""
-    of_team = len(members(senders, side))
-    guests, others = len(side) - of_team, len(members(senders, sides))
-    return of_team + max(0, min(guests, 2 - others if others else guests))
-
-
-def doubted_guests(senders: SenderRecords, now_ns: int) -> list[str]:
-    """The guests that have neither a vote nor weight beside a robot of the team, because nobody has
-    proven them right, and another guest was in quarantine or contradicted this robot of late. A
-    guest that was caught can come back under another name: all unknown ones are one party."""
-    new = [n for n, r in senders.items() if r.is_guest and r.confirmed < LEAST_CONFIRMED]
-    team = _team_recent_count(senders, now_ns) if new else set()
-    is_doubt = bool(team) and any(
-        r.reason or any(rival.name in team for rival in r.rivals)
-        for r in senders.values()
-        if r.is_guest and now_ns - r.last_report_ns <= DOUBT_NS
-    )
-    return new if is_doubt else []
-
-
-def is_left_out_guest(senders: SenderRecords, name: str, now_ns: int) -> bool:
-    """Whether a report of this guest is not used: because it is in doubt, or because it is new and
-    contradicts the estimate beside a robot of the team. Such an estimate needs no information from
-    an unknown sender."""
-    record = senders[name]
-    if not record.is_guest or record.confirmed >= LEAST_CONFIRMED:
-        return False
-    contradicts_now = record.score > 0.0 and bool(_team_recent_count(senders, now_ns))
-    return contradicts_now or name in doubted_guests(senders, now_ns)
-
-
-def _team_recent_count(senders: SenderRecords, now_ns: int) -> set[str]:
-    """The robots of the team out of quarantine that reported within the last ten seconds."""
-    return {
-        name
-        for name, r in senders.items()
-        if name != OWN_SENSORS
-        and not (r.is_guest or r.reason)
-        and now_ns - r.last_report_ns <= SILENCE_NS
-    }
-
-
-def voters(senders: SenderRecords, now_ns: int) -> list[str]:
-    """The recent teammates that have a vote, as `votes` counts them. Of guests with one vote it is
-    the first by name: any rule does, as long as it is one of them."""
-    silenced = {OWN_SENSORS, *doubted_guests(senders, now_ns)}
-    recent = sorted(name for name, _ in recent_senders(senders, now_ns) if name not in silenced)
-    guests = [name for name in recent if senders[name].is_guest]
-    return members(senders, recent) + guests[: votes(senders, guests, recent)]
+from cpcbl_team.voters import (
+    RECENT_NS,
+    SenderRecords,
+    doubted_guests,
+    is_reporting,
+    members,
+    recent_senders,
+)
 
 
 def mean_of(senders: SenderRecords, name: str, of: int) -> MeanOffset | None:
@@ -194,30 +114,9 @@ def _means_of_silent(
 def _is_silent(record: SenderRecord, now_ns: int, of: int) -> bool:
     """Whether a sender has no mean of the present, so that the last one may be out of date."""
     if of == DIRECT:
-        return not _is_reporting(record, now_ns)
+        return not is_reporting(record, now_ns)
     mean = record.means[FAST]
     return mean is None or now_ns - mean.stamp_ns > ALTERNATING_NS
-
-
-def open_rivals(senders: SenderRecords, name: str) -> tuple[Rival, ...]:
-    """The senders out of quarantine with which this one is in a contest: each contradicts the
-    other."""
-    rivals = senders[name].rivals
-    if not rivals:
-        return rivals
-    return tuple(
-        rival
-        for rival in rivals
-        if (other := senders.get(rival.name)) is not None
-        and other.reason is None
-        and any(name == back.name for back in other.rivals)
-    )
-
-
-def rival_of(record: SenderRecord, name: str, other: SenderRecord) -> Rival:
-    """The other sender as a rival of this one, with the distance between what both said last."""
-    (x, y), (ox, oy) = (r.mean_offset if r.score else (0.0, 0.0) for r in (record, other))
-    return Rival(name, ox - x, oy - y)
 
 
 def with_track_result(senders: SenderRecords, name: str) -> SenderRecord:
@@ -229,17 +128,6 @@ def with_track_result(senders: SenderRecords, name: str) -> SenderRecord:
         return record
     others = [r.track for n, r in senders.items() if n != name and r.track and not r.is_guest]
     return with_loud_track(record, is_refuted(track, others))
-
-
-def contest_m(senders: SenderRecords, name: str) -> float:
-    """How far from the estimate (m) the robot may be, according to this sender or to one with which
-    it is in a contest; 0 without a contest."""
-    record, rivals = senders[name], open_rivals(senders, name)
-    mean = record.means[FAST]
-    if mean is None or mean.stamp_ns != record.last_report_ns:  # as if the estimate followed it
-        return max((math.hypot(r.x, r.y) for r in rivals), default=0.0)
-    sides = (mean.length_m, *(math.hypot(mean.x + r.x, mean.y + r.y) for r in rivals))
-    return max(sides) if rivals else 0.0
 
 
 def compare(senders: SenderRecords, name: str, now_ns: int) -> Comparison | None:
@@ -256,6 +144,10 @@ def compare(senders: SenderRecords, name: str, now_ns: int) -> Comparison | None
             found = found._replace(is_wrong=False, is_contested=True)
     if direct is not None:
         found = direct if found is None else both(direct, found)
+    is_settled = found is not None and (found.is_wrong or found.is_confirmed)
+    if not is_settled and contradicted_before(senders, name, now_ns):
+        contested = Comparison(is_contested=True)
+        found = contested if found is None else both(found, contested)
     if wrong_turn(senders, name, now_ns) is None:
         return found
     return (found or Comparison())._replace(is_wrong=True, is_confirmed=False)
@@ -265,7 +157,7 @@ def _is_seeing(senders: SenderRecords, now_ns: int, of: int) -> bool:
     """Whether senders are compared with each other (DIRECT) by a robot whose own sensors measured
     anything lately. These say nothing of such differences, but no majority outweighs them."""
     own = senders.get(OWN_SENSORS)
-    return of == DIRECT and own is not None and _is_reporting(own, now_ns)
+    return of == DIRECT and own is not None and is_reporting(own, now_ns)
 
 
 def _sees(senders: SenderRecords, now_ns: int) -> bool:
@@ -347,11 +239,7 @@ def with_comparison(
         known = {rival.name for rival in open_rivals(senders, name)}
         rivals = ()
         if comparison.is_contested or known:
-            rivals = tuple(
-                rival
-                for rival in _contradicted(senders, name, now_ns)
-                if comparison.is_contested or rival.name in known
-            )
+            rivals = _contradicted(senders, name, now_ns, known, comparison.is_contested)
     return replace(
         record,
         bias_variance=comparison.bias_variance,
@@ -361,15 +249,19 @@ def with_comparison(
     )
 
 
-def _contradicted(senders: SenderRecords, name: str, now_ns: int) -> tuple[Rival, ...]:
+def _contradicted(
+    senders: SenderRecords, name: str, now_ns: int, known: Collection[str], has_new: bool
+) -> tuple[Rival, ...]:
     """The senders that the mean of this one contradicts, without those that the others find
-    wrong."""
-    found = {}
+    wrong: of the `known` rivals and, if it is contested (`has_new`), of all others. Known ones that
+    report too rarely for a mean stay until both agree again."""
+    found, compared = dict[str, Rival](), set[str]()
     for of in (SLOW, FAST, DIRECT):
         mean = mean_of(senders, name, of)
         if mean is None or not mean.is_precise:
             continue
         means = {name: mean, **voting_means(senders, now_ns, name, of)}
+        compared |= means.keys()
         heard = _recent_count(senders, means, now_ns)
         is_seeing = _is_seeing(senders, now_ns, of)
         for other, its in means.items():
@@ -378,4 +270,11 @@ def _contradicted(senders: SenderRecords, name: str, now_ns: int) -> tuple[Rival
             rest = {n: m for n, m in means.items() if n != other}
             if not _result(senders[other], its, rest, heard, is_seeing).is_wrong:
                 found[other] = Rival(other, its.x - mean.x, its.y - mean.y)
+    for rival in contradicted_before(senders, name, now_ns):
+        found.setdefault(rival.name, rival)
+    found = {n: rival for n, rival in found.items() if has_new or n in known}
+    silent = {n for n in known if n not in compared and _is_silent(senders[n], now_ns, FAST)}
+    for rival in without_ended_contests(senders, name, now_ns).rivals if silent else ():
+        if rival.name in silent:
+            found.setdefault(rival.name, rival)
     return tuple(found.values())

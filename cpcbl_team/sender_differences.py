@@ -5,8 +5,9 @@ from typing import Final
 
 from msgspec.structs import replace
 
+from cpcbl_team.carried_positions import RARE_NS, carried_to
 from cpcbl_team.gaussian import Covariance2
-from cpcbl_team.mean_offsets import FadingOffsets, MeanOffset, contradicts
+from cpcbl_team.mean_offsets import FAST_COMMON_M, FadingOffsets, MeanOffset, contradicts
 from cpcbl_team.position_pairs import (
     LEAST_PAIRS,
     LEAST_VARIANCE,
@@ -18,7 +19,7 @@ from cpcbl_team.position_pairs import (
 from cpcbl_team.sender_records import SILENCE_NS, SenderRecord
 
 REMEMBERED_NS: Final = 60_000_000_000  # older pairs are forgotten
-RARE_NS: Final = 300_000_000  # between two reports: with fewer, a mean of 1.5 s has too few
+SILENT_NS: Final = 3_000_000_000
 MOST_PARTNERS: Final = 12  # with whose reports those of one sender are paired
 ORIGIN: Final = MeanOffset(0.0, 0.0, Covariance2(LEAST_VARIANCE, 0.0, LEAST_VARIANCE))
 """The mean position of a sender, about itself."""
@@ -61,9 +62,11 @@ def _partners(senders: Mapping[str, SenderRecord], name: str, now_ns: int) -> li
 
 def without_pairs(senders: Mapping[str, SenderRecord]) -> Mapping[str, SenderRecord]:
     """The records of a robot whose heading was wrong, and with it the way between two reports."""
-    if not any(record.pairs for record in senders.values()):
+    if not any(record.pairs or record.carried for record in senders.values()):
         return senders
-    return {n: replace(r, pairs=NO_PAIRS, last_position=None) for n, r in senders.items()}
+    return {
+        n: replace(r, pairs=NO_PAIRS, last_position=None, carried=None) for n, r in senders.items()
+    }
 
 
 def _not_old(pairs: PositionPairs, now_ns: int) -> PositionPairs:
@@ -101,3 +104,47 @@ def positions_about(
     if not any(contradicts(ORIGIN, mean) for mean in found.values()):
         return found
     return {n: mean._replace(apart=differences(senders, n)) for n, mean in found.items()}
+
+
+def carried_positions(
+    senders: Mapping[str, SenderRecord], name: str, now_ns: int
+) -> dict[str, MeanOffset]:
+    """The positions by the other robots of the team minus that by this one, which has just reported
+    one. Guests have none: anybody may come as several of them."""
+    record = senders[name]
+    own = record.carried
+    if own is None or own.at.stamp_ns != now_ns or record.is_guest or not own.is_confirmed:
+        return {}
+    found = dict[str, MeanOffset]()
+    for other, its in senders.items():
+        carried = its.carried
+        if other == name or carried is None or its.reason is not None or its.is_guest:
+            continue
+        then = carried_to(carried.at, own.at) if carried.is_confirmed else None
+        if then is not None:
+            covariance = then.noise + then.dependent + own.at.noise + own.at.dependent
+            difference = then.x - own.at.x, then.y - own.at.y
+            found[other] = MeanOffset(
+                *difference, covariance, FAST_COMMON_M, carried.at.stamp_ns, sender=other
+            )
+    return found
+
+
+def carried_differences(
+    senders: Mapping[str, SenderRecord], name: str, now_ns: int
+) -> dict[str, MeanOffset]:
+    """Those of them that tell more than means: either reports rarely, or the other one is silent,
+    and they have no mean of pairs."""
+    found = carried_positions(senders, name, now_ns)
+    in_pairs = positions_about(senders, name, now_ns) if found else {}
+    is_rare = _is_rare(senders[name])
+    return {
+        other: mean
+        for other, mean in found.items()
+        if other not in in_pairs
+        and (is_rare or now_ns - mean.stamp_ns > SILENT_NS or _is_rare(senders[other]))
+    }
+
+
+def _is_rare(record: SenderRecord) -> bool:
+    return record.carried is not None and record.carried.is_rare

@@ -19,6 +19,7 @@ from typing import Final, NamedTuple
 import msgspec
 from msgspec.structs import replace
 
+from cpcbl_team.carried_positions import CarriedPosition, with_reported_position
 from cpcbl_team.estimate import Sums
 from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.mean_headings import COURSE_VARIANCE, NO_TURNS, FadingTurns
@@ -108,6 +109,8 @@ class TeammateReport(NamedTuple):
     """The reported heading minus the estimated one, rad, and its variance; None without one."""
     own_nis: float = 0.0
     """Against the pose by own sensors, scaled like `nis`; 0 without one."""
+    is_relay: bool = False  # whether its sender knows its place by what others tell it only
+    seen_at: ReportedPosition | None = None  # where a sighting of its sender places this robot
 
 
 class Rival(NamedTuple):
@@ -164,6 +167,7 @@ class SenderRecord(msgspec.Struct, frozen=True, gc=False):
     rivals: tuple[Rival, ...] = ()
     """With whom it is in a contest, until that is decided: also while either is silent."""
     last_position: ReportedPosition | None = None  # also if another one is compared in test 2
+    carried: CarriedPosition | None = None  # by all of them, carried on by odometry
     interval_ns: int = 0  # smoothed, between two positions that it reported
     pairs: PositionPairs = NO_PAIRS  # of its reports with those of senders of an earlier name
     denial: Denial | None = None  # of the sender that contradicts the estimate most
@@ -174,6 +178,7 @@ class SenderRecord(msgspec.Struct, frozen=True, gc=False):
     they contradict it (`hypotheses.py`): differences of chi-squares, by name."""
     confirmed: int = 0  # reports beside which another source agreed with it
     is_guest: bool = False
+    is_relay: bool = False
     headings: FadingTurns = NO_TURNS  # that it reported
     courses: FadingTurns = NO_TURNS  # of the positions that it reported
 
@@ -185,6 +190,10 @@ def with_report(record: SenderRecord, report: TeammateReport, limit: float) -> S
     record = _with_position(_with_faded_conflicts(record, report.stamp_ns), report.position)
     last_ns, own_nis = max(record.last_report_ns, report.stamp_ns), report.own_nis
     record = replace(record, last_report_ns=last_ns, is_guest=report.is_guest, own_nis=own_nis)
+    record = replace(record, is_relay=report.is_relay)
+    at = report.position or report.seen_at
+    if at is not None:
+        record = replace(record, carried=with_reported_position(record.carried, at))
     if report.nis is None:
         return record
     if report.heading is not None:

@@ -6,7 +6,6 @@ covariance is inflated.
 """
 
 from collections.abc import Collection, Iterable
-from itertools import product
 
 from msgspec.structs import replace
 
@@ -14,7 +13,8 @@ from cpcbl_team import trust
 from cpcbl_team.common_error_filter import CommonErrorFilter
 from cpcbl_team.compromises import compromise, doubt_variance
 from cpcbl_team.config import LocalizationSettings
-from cpcbl_team.estimate import Covariance3, Information, Sums, circle_variance
+from cpcbl_team.contests import contest_m
+from cpcbl_team.estimate import Information, circle_variance
 from cpcbl_team.fixes import PoseObservation
 from cpcbl_team.fusion import Observation
 from cpcbl_team.gaussian import Covariance2, Gaussian2
@@ -23,30 +23,22 @@ from cpcbl_team.inflation import inflate_by_offset, inflate_to
 from cpcbl_team.inputs import Belief, Input, LandmarkBelief, Position, Sightings
 from cpcbl_team.landmarks import LandmarkUpdate
 from cpcbl_team.led_astray import OwnPoses, gaps_of
-from cpcbl_team.mean_offsets import (
-    HEADING_VARIANCE,
-    NOTHING,
-    about_position,
-    with_heading_error,
-    with_position_error,
-)
 from cpcbl_team.measurements import (
     GatedObject,
     GatedObjects,
-    Measurement,
     combine,
     nearest_belief,
     observation_of,
 )
+from cpcbl_team.offset_evidence import (
+    evidence_at,
+    evidence_of_sighting,
+    own_offset,
+    position_by_sighting,
+    with_camera,
+)
 from cpcbl_team.recovery_evidence import without_senders
 from cpcbl_team.reported_tracks import OdometryErrors, ReportedPosition
-from cpcbl_team.sender_comparisons import (
-    LEAST_CONFIRMED,
-    RECENT_NS,
-    SenderRecords,
-    contest_m,
-    voters,
-)
 from cpcbl_team.sender_records import (
     NEVER_NS,
     OWN_SENSORS,
@@ -54,10 +46,8 @@ from cpcbl_team.sender_records import (
     TeammateReport,
 )
 from cpcbl_team.state import State, with_memory, with_senders, with_teammates
+from cpcbl_team.voters import LEAST_CONFIRMED, RECENT_NS, SenderRecords, voters
 
-INDEPENDENT_FRAMES = 0.1  # of a camera: the next frame has nearly the same errors of tilt and edges
-CHANGING_M2 = 0.05**2  # the most of the variance (xx + yy) that is another error at the next report
-FARTHEST_OFFSET_M = 1.0  # of what a frame tells of the position, where it tells little
 MOST_SENDERS = 512  # of which records are kept
 
 
@@ -71,12 +61,13 @@ class TeammateScreen:
         is_probabilistic: bool,
         teammates: Collection[str] | None = None,
         common: CommonErrorFilter | None = None,
+        relays: Collection[str] = (),
     ) -> None:
         """`gates`: chi-square bounds of one and of two degrees of freedom. Without a covariance
         there is no NIS, and nothing is screened. `teammates`: the robots of the team; all others
         are guests (None: there are no guests). `common`: the errors that own sightings have in
-        common."""
-        self._teammates = teammates
+        common. `relays`: who knows its place only by what others tell it."""
+        self._teammates, self._relays = teammates, relays
         self._collaboration, self._rules = settings.collaboration, settings.collaboration.trust
         self._localizer_rules = settings.localizer
         self._gates = gates
@@ -107,7 +98,7 @@ class TeammateScreen:
         accepted, rejected = accepted + len(landmarks.used), rejected + len(landmarks.rejected)
         if (accepted or rejected) and not is_lost:
             sums = combine(Information.of(landmarks.evidence.sums()), gated.accepted)
-            own = _own_offset(state, sums, gated.accepted)
+            own = own_offset(state, sums, gated.accepted)
             state = self._with_own_sensors(state, accepted, rejected, own)
             if accepted:
                 state = self.own.after_frame(state, sums, gated.accepted)
@@ -131,14 +122,24 @@ class TeammateScreen:
         for (sender, is_teammate), objects in reports.items():
             beliefs = state.memory.teammates.beliefs
             is_fresh = not is_teammate or _has_fresh(beliefs[sender], now)
-            of_two, evidence, (first, *_) = None, None, objects
+            of_two, evidence, seen_at, (first, *_) = None, None, None, objects
             if is_fresh and not state.lost and not self.own.is_guessed(state):
                 freedom = sum(len(found.constraints) for found in objects)
                 of_two = 2.0 * sum(found.nis for found in objects) / freedom
                 if first.observation:
-                    of_it = self._evidence(state, first.observation)
-                    evidence = _with_camera(state, first.measurement, of_it)
-            report = TeammateReport(now, of_two, evidence=evidence, is_guest=self._is_guest(sender))
+                    of_it = evidence_of_sighting(state, first.observation)
+                    evidence = with_camera(state, first.measurement, of_it)
+                    if is_teammate:
+                        errors = self._odometry_errors
+                        seen_at = position_by_sighting(state, first.observation, errors)
+            report = TeammateReport(
+                now,
+                of_two,
+                evidence=evidence,
+                is_guest=self._is_guest(sender),
+                is_relay=sender in self._relays,
+                seen_at=seen_at,
+            )
             if first.observation:
                 report = report._replace(own_nis=self.own.nis_of_sighting(state, first))
                 of_first = first.observation, self._rules.least_sigma_m, first.sensitivities
@@ -219,13 +220,6 @@ class TeammateScreen:
     def _is_guest(self, sender: str) -> bool:
         return self._teammates is not None and sender not in self._teammates
 
-    def _evidence(self, state: State, observation: Observation) -> OffsetEvidence:
-        """What a sighting of a teammate says about the offset of the estimate."""
-        dependent = observation.dependent
-        sums = observation.information(observation.noise(0.0))
-        variance = 0.5 * (dependent.xx + dependent.yy)
-        return _evidence_at(state, sums, Covariance2(variance, 0.0, variance))
-
     def screen_observation(
         self, state: State, observation: PoseObservation, position: Observation, nis: float
     ) -> tuple[State, bool]:
@@ -240,7 +234,7 @@ class TeammateScreen:
             if self.has_recent_reports(state, now) and not is_lost:
                 is_accepted = nis <= self._gates[1]
                 sums = position.information(position.noise(0.0))
-                own = _evidence_at(state, sums)
+                own = evidence_at(state, sums)
                 state = self._with_own_sensors(state, is_accepted, not is_accepted, own)
                 state = self.own.after_position(state, position, is_accepted)
             return state, True
@@ -262,10 +256,11 @@ class TeammateScreen:
             None if is_lost or is_guessed else nis,
             (ex, ey),
             None if is_guessed else ReportedPosition(*where, *known, turn_variance),
-            _evidence_at(state, position.information(independent), position.dependent),
+            evidence_at(state, position.information(independent), position.dependent),
             self._is_guest(observation.sender),
             of_heading,
             self.own.nis(state, position),
+            is_relay=observation.sender in self._relays,
         )
         of_it = observation.sender, position, self._rules.least_sigma_m
         state = self.own.after_report(state, *of_it)
@@ -322,63 +317,6 @@ class TeammateScreen:
             state = state._replace(estimate=estimate)
         teammates = with_senders(memory.teammates, _bounded(decision.senders))
         return with_teammates(state, teammates), decision.trusted
-
-
-def _evidence_at(state: State, sums: Sums, dependent: Covariance2 = NOTHING) -> OffsetEvidence:
-    """Sums about the offset of the state's estimate, in which the error of its position counts as
-    noise. Where an error lasts, as in a contest, only a part of it changes between reports; the
-    means are to find the rest, so only that part counts."""
-    c = state.estimate.covariance
-    share = min(1.0, CHANGING_M2 / max(c.xx + c.yy, CHANGING_M2))
-    sums = with_position_error(sums, Covariance2(share * c.xx, share * c.xy, share * c.yy))
-    return OffsetEvidence(sums, dependent, c.hh, c.xx + c.yy)
-
-
-def _own_offset(state: State, sums: Information, accepted: Iterable[GatedObject]) -> OffsetEvidence:
-    """What the robot's own sensors say about the offset of the estimate in one frame."""
-    common, variance = state.common_errors, state.estimate.covariance.hh
-    if common is None:
-        return _evidence_at(state, with_heading_error(sums, variance))
-    of_parameter: dict[int, Information] = {}
-    for found in accepted:
-        if not found.measurement.sender:
-            for c, sensitivity in zip(found.constraints, found.sensitivities, strict=True):
-                for i, factor in sensitivity:
-                    before = of_parameter.get(i, Information.none())
-                    of_parameter[i] = before.add(c.row, factor, c.sigma * c.sigma)
-    place, turn = 1.0 / FARTHEST_OFFSET_M**2, 1.0 / (variance + HEADING_VARIANCE)
-    prior = Covariance3(place, 0.0, place, 0.0, 0.0, turn)
-    inverse = sums.matrix.plus(prior).inverse()
-    moved = {i: inverse.times(information.vector) for i, information in of_parameter.items()}
-    covariance, xx, xy, yy = common.parameters.covariance, 0.0, 0.0, 0.0
-    for (i, (ax, ay, _)), (j, (bx, by, _)) in product(moved.items(), repeat=2):
-        both = covariance[i][j]
-        xx, xy, yy = xx + ax * bx * both, xy + ax * by * both, yy + ay * by * both
-    position = _without_heading(sums, variance)
-    of_frame = OffsetEvidence(position).weighted(INDEPENDENT_FRAMES).evidence
-    return _evidence_at(state, of_frame, Covariance2(xx, xy, yy))
-
-
-def _with_camera(state: State, m: Measurement, evidence: OffsetEvidence) -> OffsetEvidence:
-    """What a sighting of a teammate says about the offset, with the errors of the heading and the
-    constant errors of the camera as noise."""
-    common = state.common_errors
-    if common is None:
-        sums = with_heading_error(evidence.evidence, evidence.heading_variance)
-        return evidence._replace(evidence=sums)
-    (x, y, covariance), pose = m.position, state.estimate.pose
-    of_camera = common.reading_variances(common.axis_rad if m.bearing is None else m.bearing)
-    squared = (x - pose.x) ** 2 + (y - pose.y) ** 2
-    variance = 0.5 * (covariance.xx + covariance.yy + squared * sum(of_camera))
-    sums = _without_heading(evidence.evidence, evidence.heading_variance)
-    return evidence._replace(evidence=sums, dependent=Covariance2(variance, 0.0, variance))
-
-
-def _without_heading(sums: Sums, heading_variance: float) -> Information:
-    """What a frame says about the position alone, because the error of the heading differs from
-    frame to frame."""
-    (xx, xy, yy), (x, y) = about_position(sums, heading_variance)
-    return Information(Covariance3(xx, xy, yy, 0.0, 0.0, 0.0), (x, y, 0.0))
 
 
 def _bounded(senders: SenderRecords) -> SenderRecords:

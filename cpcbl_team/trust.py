@@ -22,6 +22,15 @@ from msgspec.structs import replace
 
 from cpcbl_team.compromises import compromise
 from cpcbl_team.config import TrustSettings
+from cpcbl_team.contests import (
+    contest_m,
+    contest_of_sources_m,
+    open_rivals,
+    rival_of,
+    with_mutual_contests,
+    with_silent_rivals,
+    without_ended_contests,
+)
 from cpcbl_team.disputes import (
     dissenting,
     score_bound,
@@ -33,19 +42,8 @@ from cpcbl_team.mean_comparisons import EVIDENCE_ON_MOST, Comparison
 from cpcbl_team.mean_offsets import DIRECT, FAST, disagreement
 from cpcbl_team.overturned_quarantines import outvoted_majority, witnesses_of_contest
 from cpcbl_team.sender_comparisons import (
-    RECENT_NS,
-    SenderRecords,
     compare,
-    contest_m,
-    is_left_out_guest,
     mean_of,
-    members,
-    open_rivals,
-    recent_senders,
-    reporting_senders,
-    rival_of,
-    senders_with_a_say,
-    votes,
     voting_means,
     with_comparison,
     with_track_result,
@@ -70,6 +68,16 @@ from cpcbl_team.sender_records import (
     with_evidence,
     with_report,
     without_comparisons,
+)
+from cpcbl_team.voters import (
+    RECENT_NS,
+    SenderRecords,
+    is_left_out_guest,
+    members,
+    recent_senders,
+    reporting_senders,
+    senders_with_a_say,
+    votes,
 )
 
 FRESH_BELIEF_NS: Final = 300_000_000  # the robot of an older belief may have turned since
@@ -137,7 +145,8 @@ def assess(
         heard = {n: released(decision.senders[n], now_ns) for n in witnesses}
         decision = decision._replace(senders={**decision.senders, **heard}, event="readmitted")
     senders, between = decision.senders, compromise(decision.senders, name)
-    least_m = 0.0 if between else max(decision.least_sigma_m, contest_m(senders, name))
+    widest_m = max(contest_m(senders, name), contest_of_sources_m(senders, name))
+    least_m = 0.0 if between else max(decision.least_sigma_m, widest_m)
     is_used = decision.trusted and not (between and between.is_outweighed)
     is_used = is_used and not is_left_out_guest(senders, name, report.stamp_ns)
     return decision._replace(trusted=is_used, least_sigma_m=least_m)
@@ -152,11 +161,13 @@ def _decide(
     record = with_track_result({**senders, name: record}, name)
     record = with_denial(record, senders, name, report)
     senders = with_pairs({**senders, name: record}, name)
-    record = senders[name]
     comparison = compare(senders, name, now)
+    if comparison is None:
+        senders = {**senders, name: without_ended_contests(senders, name, now)}
+    record = senders[name]
     if comparison is not None:
         record = with_comparison(senders, name, comparison, now)
-        senders = {**senders, name: record}
+        senders = with_mutual_contests({**senders, name: record}, name, now)
     if record.reason:
         return _assess_quarantined(senders, name, report, comparison, rules)
     if record.odometry_conflicts > MOST_CONFLICTS and not _is_odometry_wrong(senders, name, rules):
@@ -212,6 +223,8 @@ def _decide_dispute(
     dissenters = dissenting(recent, rules.limit) | supporters_of_dissent(recent, bound)
     supporters = supporters_of_estimate(recent, dissenters, bound, began_ns)
     if not supporters:
+        if name in dissenters:
+            senders = with_silent_rivals(senders, name, now_ns)
         return TrustDecision(senders, True)
     rivals = {r.name for n in dissenters for r in open_rivals(senders, n)}
     if not rivals.isdisjoint(supporters) or any(_is_open(senders[n]) for n in dissenters):
@@ -221,7 +234,9 @@ def _decide_dispute(
         return _without_decision(TrustDecision(senders, True), dissenters, now_ns)
     is_right = _is_estimate_right(recent, dissenters, supporters, began_ns, now_ns)
     if is_right is None:
-        return TrustDecision(senders, False)
+        if now_ns - began_ns < TIE_NS:
+            return TrustDecision(senders, False)
+        return _without_decision(TrustDecision(senders, True), dissenters, now_ns)
     if not is_right:
         return _quarantine_supporters(senders, dissenters, supporters, name, now_ns)
     if name in dissenters and recent[name].score > rules.limit:
@@ -246,7 +261,15 @@ def _is_estimate_right(
     for_it, against = (votes(recent, side, all_sides) for side in (supporters, dissenters))
     if for_it != against:
         return for_it > against
-    return True if now_ns - began_ns >= TIE_NS else None
+    is_sudden = all(_is_guest_or_agreed(recent[n], began_ns) for n in dissenters)
+    return True if is_sudden and now_ns - began_ns >= TIE_NS else None
+
+
+def _is_guest_or_agreed(record: SenderRecord, began_ns: int) -> bool:
+    """Whether a sender agreed with the estimate just before a dispute began: then it is its error
+    that changed. One that comes anew may be right, and those wrong that came before. Guests have to
+    prove themselves."""
+    return record.is_guest or began_ns - record.last_agreement_ns <= SILENCE_NS
 
 
 def _is_open(record: SenderRecord) -> bool:

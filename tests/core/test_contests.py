@@ -13,13 +13,13 @@ from support.sweeps import sampled
 from support.trust import AGREES, RULES
 
 from cpcbl_team.config import Field, Start, Unsurveyed
+from cpcbl_team.contests import contest_m, open_rivals
 from cpcbl_team.estimate import Covariance3
 from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.geometry import Pose2
 from cpcbl_team.inflation import inflate_to
 from cpcbl_team.inputs import BeliefShared
 from cpcbl_team.mean_offsets import FadingOffsets, MeanOffset
-from cpcbl_team.sender_comparisons import contest_m, open_rivals
 from cpcbl_team.sender_records import (
     OWN_SENSORS,
     OffsetEvidence,

@@ -7,7 +7,9 @@ from support.trust import AGREES, CONTRADICTS, Receiver
 
 from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.mean_offsets import FAST, FadingOffsets, MeanOffset
-from cpcbl_team.sender_comparisons import (
+from cpcbl_team.sender_comparisons import voting_means
+from cpcbl_team.sender_records import SILENCE_NS, QuarantineReason, Rival, SenderRecord
+from cpcbl_team.voters import (
     DOUBT_NS,
     LEAST_CONFIRMED,
     SenderRecords,
@@ -15,9 +17,7 @@ from cpcbl_team.sender_comparisons import (
     is_left_out_guest,
     senders_with_a_say,
     voters,
-    voting_means,
 )
-from cpcbl_team.sender_records import SILENCE_NS, QuarantineReason, Rival, SenderRecord
 
 NOW_NS = 100 * SECOND
 SIGMA2 = 0.01**2

@@ -11,9 +11,9 @@ from cpcbl_team.geometry import Pose2
 from cpcbl_team.mean_headings import NO_TURNS, FadingTurns, MeanTurn, contradicting
 from cpcbl_team.mean_offsets import FadingOffsets
 from cpcbl_team.reported_tracks import ReportedPosition
-from cpcbl_team.sender_comparisons import SenderRecords
 from cpcbl_team.sender_records import NEVER_NS, TeammateReport
 from cpcbl_team.trust import assess
+from cpcbl_team.voters import SenderRecords
 
 SECOND = 1_000_000_000
 DEGREE = math.radians(1.0)

@@ -4,8 +4,9 @@ import pytest
 
 from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.mean_offsets import FAST, FadingOffsets, MeanOffset
-from cpcbl_team.sender_comparisons import compare, voters, votes, voting_means
+from cpcbl_team.sender_comparisons import compare, voting_means
 from cpcbl_team.sender_records import OWN_SENSORS, SenderRecord
+from cpcbl_team.voters import voters, votes
 
 NOW_NS = 5_000_000_000
 THIN, VAGUE = (0.01, 0.25), (0.25, 0.25)

@@ -10,11 +10,11 @@ from support.core import (
 )
 from support.trust import AGREES, CONTRADICTS, MS, RULES, Receiver
 
+from cpcbl_team.contests import contest_m
 from cpcbl_team.disputes import united_majority
 from cpcbl_team.estimate import Covariance3
 from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.mean_offsets import MeanOffset
-from cpcbl_team.sender_comparisons import contest_m
 from cpcbl_team.sender_records import (
     OWN_SENSORS,
     USUAL_NIS,

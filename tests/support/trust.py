@@ -3,9 +3,9 @@
 from cpcbl_team.config import (
     TrustSettings,
 )
-from cpcbl_team.sender_comparisons import SenderRecords
 from cpcbl_team.sender_records import NEVER_NS, TeammateReport
 from cpcbl_team.trust import TrustDecision, assess, with_own_sensor_result
+from cpcbl_team.voters import SenderRecords
 
 MS = 1_000_000
 RULES = TrustSettings()
