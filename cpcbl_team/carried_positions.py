@@ -62,7 +62,7 @@ def with_reported_position(
     at = now._replace(
         x=then.x + kxx * dx + kxy * dy,
         y=then.y + kyx * dx + kyy * dy,
-        noise=_through(rest, then.noise) + _through(gain, now.noise),
+        noise=_mapped_covariance(rest, then.noise) + _mapped_covariance(gain, now.noise),
         dependent=then.dependent.scaled(1.0 - share) + now.dependent.scaled(share),
     )
     return CarriedPosition(at, before.reports + 1, interval_ns)
@@ -75,7 +75,7 @@ def _gain(before: Covariance2, of_both: Covariance2) -> Matrix:
     return axx * xx + axy * xy, axx * xy + axy * yy, axy * xx + ayy * xy, axy * xy + ayy * yy
 
 
-def _through(matrix: Matrix, covariance: Covariance2) -> Covariance2:
+def _mapped_covariance(matrix: Matrix, covariance: Covariance2) -> Covariance2:
     """M C M^T."""
     a, b, c, d = matrix
     xx, xy, yy = covariance

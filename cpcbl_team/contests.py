@@ -22,6 +22,7 @@ from cpcbl_team.voters import SenderRecords, is_reporting
 
 CARRIED_CONFLICT: Final = 9.2
 """The same as `CONFLICT` for what senders said at different times (chi-square)."""
+REMEMBERED_NS: Final = 300_000_000_000  # a contest with a silent sender
 AGREEMENT: Final = 6.0
 """Two senders agree again if that makes their present difference so much more likely than the one
 of their contest (a difference of chi-squares)."""
@@ -134,12 +135,19 @@ def with_silent_rivals(senders: SenderRecords, name: str, now_ns: int) -> Sender
 
 def without_ended_contests(senders: SenderRecords, name: str, now_ns: int) -> SenderRecord:
     """The record of a sender without those rivals with which it agrees again by their positions
-    carried on until now: a difference of zero is clearly more likely than that of their contest."""
+    carried on until now: a difference of zero is clearly more likely than that of their contest.
+    Nor is one remembered that has been silent for very long: it may never come back."""
     record = senders[name]
     if not record.rivals:
         return record
     found = carried_differences(senders, name, now_ns)
-    rivals = tuple(r for r in record.rivals if not _is_over(r, found.get(r.name)))
+    rivals = tuple(
+        r
+        for r in record.rivals
+        if (other := senders.get(r.name)) is not None
+        and now_ns - other.last_report_ns <= REMEMBERED_NS
+        and not _is_over(r, found.get(r.name))
+    )
     return record if rivals == record.rivals else replace(record, rivals=rivals)
 
 

@@ -39,6 +39,7 @@ class FixClaims:
         has_places = not team.map.is_frame_agreed  # in the frame of the fixes
         self._observers = {n: _observer(r, has_places) for n, r in robots.items()}
         self._nearest_m = rules.nearest_m
+        # Their fixes rest on what others told them, whoever that was.
         self.relays = frozenset(n for n, r in team.robots.items() if _is_relay(r))
 
     def used(self, state: State, stated: PoseObservation) -> tuple[State, PoseObservation]:

@@ -102,8 +102,7 @@ class Localizer:
         self._stationary = StationaryCheck(settings, self._variant.reduce, has_common)
         self.recovery = Recovery(settings, field, self._landmarks, self._variant.reduce)
         common, is_probabilistic = self._common, self._variant.is_probabilistic
-        relays = frozenset[str]() if claims is None else claims.relays
-        self.screen = TeammateScreen(settings, gates, is_probabilistic, team, common, relays)
+        self.screen = TeammateScreen(settings, gates, is_probabilistic, team, common, claims)
         self._claims = claims if self.screen.is_active else None
         self.landmark_beliefs = LandmarkBeliefs(settings, field, self._common, self.screen)
 

@@ -15,6 +15,7 @@ from cpcbl_team.compromises import compromise, doubt_variance
 from cpcbl_team.config import LocalizationSettings
 from cpcbl_team.contests import contest_m
 from cpcbl_team.estimate import Information, circle_variance
+from cpcbl_team.fix_claims import FixClaims
 from cpcbl_team.fixes import PoseObservation
 from cpcbl_team.fusion import Observation
 from cpcbl_team.gaussian import Covariance2, Gaussian2
@@ -61,13 +62,14 @@ class TeammateScreen:
         is_probabilistic: bool,
         teammates: Collection[str] | None = None,
         common: CommonErrorFilter | None = None,
-        relays: Collection[str] = (),
+        claims: FixClaims | None = None,
     ) -> None:
         """`gates`: chi-square bounds of one and of two degrees of freedom. Without a covariance
         there is no NIS, and nothing is screened. `teammates`: the robots of the team; all others
         are guests (None: there are no guests). `common`: the errors that own sightings have in
-        common. `relays`: who knows its place only by what others tell it."""
-        self._teammates, self._relays = teammates, relays
+        common. `claims`: of these, who knows its place only by what others tell it."""
+        self._teammates = teammates
+        self._relays = frozenset[str]() if claims is None else claims.relays
         self._collaboration, self._rules = settings.collaboration, settings.collaboration.trust
         self._localizer_rules = settings.localizer
         self._gates = gates

@@ -161,9 +161,8 @@ def _decide(
     record = with_track_result({**senders, name: record}, name)
     record = with_denial(record, senders, name, report)
     senders = with_pairs({**senders, name: record}, name)
+    senders = {**senders, name: without_ended_contests(senders, name, now)}
     comparison = compare(senders, name, now)
-    if comparison is None:
-        senders = {**senders, name: without_ended_contests(senders, name, now)}
     record = senders[name]
     if comparison is not None:
         record = with_comparison(senders, name, comparison, now)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec.structs import replace
 from support.core import SECOND, matrix2
 from support.observed_drive import Drive, Observed, correct
 from support.sweeps import sampled
@@ -19,7 +20,13 @@ from cpcbl_team.carried_positions import (
     carried_to,
     with_reported_position,
 )
-from cpcbl_team.contests import AGREEMENT, contest_m, contest_of_sources_m, open_rivals
+from cpcbl_team.contests import (
+    AGREEMENT,
+    REMEMBERED_NS,
+    contest_m,
+    contest_of_sources_m,
+    open_rivals,
+)
 from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.geometry import Pose2
 from cpcbl_team.mean_offsets import NOTHING
@@ -192,6 +199,25 @@ def test_a_contest_lasts_while_nothing_tells_and_ends_when_both_agree_again() ->
         again = heard(again, "east", reported(t + 0.5, 0.0, sigma_m=0.2))
     assert rivals(again) == {"west": set(), "east": set()}
     assert AGREEMENT < (1.0 / 0.2) ** 2
+
+
+def test_a_contest_with_a_robot_that_left_for_good_is_forgotten() -> None:
+    """Or else one chance would leave a robot uncertain for ever."""
+    senders = in_turn({"west": 0.0, "east": 1.0})
+    long_s = REMEMBERED_NS / SECOND
+    for at_s, left in ((long_s - 1.0, {"west"}), (long_s + 10.0, set())):
+        senders = heard(senders, "east", reported(at_s, 1.0))
+        assert rivals(senders)["east"] == left
+
+
+def test_of_three_a_majority_speaks_for_a_sender_and_no_contest_begins() -> None:
+    """A relay is no witness: what it says may come from either side."""
+    senders = in_turn({"west": 0.0, "north": 0.05, "east": 1.0})
+    assert rivals(senders)["east"] == set()
+    relayed: Records = {**senders, "north": replace(senders["north"], is_relay=True)}
+    for t in range(30, 32):
+        relayed = heard(relayed, "east", reported(float(t), 1.0, sigma_m=0.2))
+    assert "west" in rivals(relayed)["east"]
 
 
 def test_two_that_report_often_are_compared_by_their_means() -> None:
