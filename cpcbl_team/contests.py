@@ -77,14 +77,19 @@ def contradicted_before(senders: SenderRecords, name: str, now_ns: int) -> tuple
     """The senders that said something else before, by their positions carried on until now, where
     no majority speaks for either. The robot may have been carried away since then, so this finds
     nobody wrong. Own sensors decide better."""
-    own = senders.get(OWN_SENSORS)
-    if own is not None and is_reporting(own, now_ns):
+    if _has_own_sensors(senders, now_ns):
         return ()
     differences = carried_differences(senders, name, now_ns).items()
     against = {n: d for n, d in differences if disagreement(ORIGIN, d) > CARRIED_CONFLICT}
     all_ = carried_positions(senders, name, now_ns) if against else {}
     voting = [d for n, d in all_.items() if not senders[n].is_relay]
     return tuple(Rival(n, d.x, d.y) for n, d in against.items() if not _is_decided(d, voting))
+
+
+def _has_own_sensors(senders: SenderRecords, now_ns: int) -> bool:
+    """Whether this robot's own sensors measured anything lately, whatever they agreed with."""
+    own = senders.get(OWN_SENSORS)
+    return own is not None and is_reporting(own, now_ns)
 
 
 def _is_decided(rival: MeanOffset, others: Iterable[MeanOffset]) -> bool:
@@ -117,7 +122,9 @@ def with_mutual_contests(senders: SenderRecords, name: str, now_ns: int) -> Send
 def with_silent_rivals(senders: SenderRecords, name: str, now_ns: int) -> SenderRecords:
     """The records where a sender that contradicts the estimate is in a contest with those that
     reported before and are silent now. Nobody else supports the estimate, so either they are wrong,
-    or this one, or the robot was carried away."""
+    or this one, or the robot was carried away. Own sensors tell which."""
+    if _has_own_sensors(senders, now_ns):
+        return senders
     changed, rivals = dict[str, SenderRecord](), {r.name: r for r in senders[name].rivals}
     for other, d in carried_differences(senders, name, now_ns).items():
         record = senders[other]

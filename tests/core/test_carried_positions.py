@@ -238,14 +238,18 @@ def test_what_a_relay_says_is_no_more_certain_than_the_contest_of_its_sources() 
 
 def test_who_contradicts_the_estimate_alone_is_contested_by_those_that_are_away() -> None:
     """Where its place is vague, the estimate still contradicts it clearly. The robot may have been
-    carried away, so nobody is in quarantine."""
-    senders = in_turn({"west": 0.0})
-    for t in range(20, 24):
-        at = reported(float(t), 1.0, sigma_m=0.9)
-        report = TeammateReport(at.stamp_ns, CONTRADICTS, (1.0, 0.0), position=at)
-        senders = assess(senders, "east", report, 0, RULES).senders
-    assert rivals(senders)["east"] == {"west"}
-    assert senders["east"].reason is None
+    carried away, so nobody is in quarantine. Own sensors tell that: with a contest a robot that was
+    carried past landmarks found itself 5 to 9 s later."""
+    for is_seeing in (False, True):
+        senders = in_turn({"west": 0.0})
+        for t in range(20, 24):
+            at = reported(float(t), 1.0, sigma_m=0.9)
+            if is_seeing:
+                senders = {**senders, OWN_SENSORS: SenderRecord(at.stamp_ns)}
+            report = TeammateReport(at.stamp_ns, CONTRADICTS, (1.0, 0.0), position=at)
+            senders = assess(senders, "east", report, 0, RULES).senders
+        assert rivals(senders)["east"] == (set() if is_seeing else {"west"})
+        assert senders["east"].reason is None
 
 
 def test_of_two_a_newcomer_is_contested_and_one_that_changed_is_quarantined() -> None:
