@@ -81,9 +81,15 @@ def contradicted_before(senders: SenderRecords, name: str, now_ns: int) -> tuple
         return ()
     differences = carried_differences(senders, name, now_ns).items()
     against = {n: d for n, d in differences if disagreement(ORIGIN, d) > CARRIED_CONFLICT}
-    all_ = carried_positions(senders, name, now_ns) if against else {}
-    voting = [d for n, d in all_.items() if not senders[n].is_relay]
-    return tuple(Rival(n, d.x, d.y) for n, d in against.items() if not _is_decided(d, voting))
+    voting = _witnesses(senders, name, now_ns) if against else []
+    rivals = (Rival(n, d.x, d.y) for n, d in against.items())
+    return tuple(r for r in rivals if not _is_decided(r, voting))
+
+
+def _witnesses(senders: SenderRecords, name: str, now_ns: int) -> list[MeanOffset]:
+    """Where others that are no relays say that the robot is, from where this sender says so."""
+    places = carried_positions(senders, name, now_ns)
+    return [place for n, place in places.items() if not senders[n].is_relay]
 
 
 def _has_own_sensors(senders: SenderRecords, now_ns: int) -> bool:
@@ -92,15 +98,14 @@ def _has_own_sensors(senders: SenderRecords, now_ns: int) -> bool:
     return own is not None and is_reporting(own, now_ns)
 
 
-def _is_decided(rival: MeanOffset, others: Iterable[MeanOffset]) -> bool:
-    """Whether more of the others say the same as a sender than as its rival, or fewer. Where they
-    say that the robot is, they say from where this sender says so."""
-    leads = [_lead(other, rival) for other in others if other.sender != rival.sender]
+def _is_decided(rival: Rival, others: Iterable[MeanOffset]) -> bool:
+    """Whether more of the others say the same as a sender than as its rival, or fewer."""
+    leads = [_lead(other, rival) for other in others if other.sender != rival.name]
     for_it, against = (sum(sign * lead > CLEAR_LEAD for lead in leads) for sign in (1.0, -1.0))
     return for_it != against
 
 
-def _lead(other: MeanOffset, rival: MeanOffset) -> float:
+def _lead(other: MeanOffset, rival: Rival) -> float:
     """By how much the place of another is nearer to that of a sender than to that of its rival."""
     from_rival = other._replace(x=other.x - rival.x, y=other.y - rival.y)
     return disagreement(ORIGIN, from_rival) - disagreement(ORIGIN, other)
@@ -143,17 +148,20 @@ def with_silent_rivals(senders: SenderRecords, name: str, now_ns: int) -> Sender
 def without_ended_contests(senders: SenderRecords, name: str, now_ns: int) -> SenderRecord:
     """The record of a sender without those rivals with which it agrees again by their positions
     carried on until now: a difference of zero is clearly more likely than that of their contest.
-    Nor is one remembered that has been silent for very long: it may never come back."""
+    Nor is a rival remembered if most others speak for one of both, as if it still said the same, or
+    if it has been silent for very long: it may never come back."""
     record = senders[name]
     if not record.rivals:
         return record
     found = carried_differences(senders, name, now_ns)
+    voting = [] if _has_own_sensors(senders, now_ns) else _witnesses(senders, name, now_ns)
     rivals = tuple(
         r
         for r in record.rivals
         if (other := senders.get(r.name)) is not None
         and now_ns - other.last_report_ns <= REMEMBERED_NS
         and not _is_over(r, found.get(r.name))
+        and not _is_decided(r, voting)
     )
     return record if rivals == record.rivals else replace(record, rivals=rivals)
 

@@ -220,6 +220,15 @@ def test_of_three_a_majority_speaks_for_a_sender_and_no_contest_begins() -> None
     assert "west" in rivals(relayed)["east"]
 
 
+def test_a_third_robot_ends_a_contest_though_one_side_is_silent() -> None:
+    """In random world 8057 one by chance lasted for half of the run, because one side had left."""
+    senders = in_turn({"west": 0.0, "east": 1.0})
+    for t in range(20, 30):
+        senders = heard(senders, "north", reported(float(t), 0.0, sigma_m=0.2))
+        senders = heard(senders, "west", reported(t + 0.5, 0.0, sigma_m=0.2))
+    assert rivals(senders) == {"west": set(), "east": set(), "north": set()}
+
+
 def test_two_that_report_often_are_compared_by_their_means() -> None:
     senders: Records = {}
     for i in range(40):
