@@ -11,15 +11,13 @@ by covariance intersection, Julier & Uhlmann 2001.)
 from typing import Final, NamedTuple
 
 from cpcbl_team.gaussian import Covariance2
-from cpcbl_team.geometry import Pose2
 from cpcbl_team.mean_offsets import CONFLICT
-from cpcbl_team.reported_tracks import ReportedPosition, motion_between
+from cpcbl_team.position_pairs import LEAST_VARIANCE, LONGEST_PAIR_NS
+from cpcbl_team.reported_tracks import ReportedPosition, place_after
 
 LONGEST_NS: Final = 60_000_000_000  # so long is a position carried on
 LEAST_REPORTS: Final = 3  # that agree: with fewer it may be an outlier
 RARE_NS: Final = 300_000_000  # between two reports: with fewer, a mean of 1.5 s has too few
-LONGEST_INTERVAL_NS: Final = 2_000_000_000  # a longer one counts for no more
-LEAST_VARIANCE: Final = 1e-6  # m^2, of an exact report
 Matrix = tuple[float, float, float, float]  # xx, xy, yx, yy
 
 
@@ -49,8 +47,7 @@ def with_reported_position(
     then = None if before is None else carried_to(before.at, now)
     if before is None or then is None:
         return CarriedPosition(now)
-    elapsed_ns = min(now.stamp_ns - before.at.stamp_ns, LONGEST_INTERVAL_NS)
-    interval_ns = (before.interval_ns + elapsed_ns) // 2
+    interval_ns = smoothed_interval_ns(before.interval_ns, now.stamp_ns - before.at.stamp_ns)
     dx, dy = now.x - then.x, now.y - then.y
     least = Covariance2(LEAST_VARIANCE, 0.0, LEAST_VARIANCE)
     covariance = then.noise + then.dependent + now.noise + now.dependent + least
@@ -66,6 +63,12 @@ def with_reported_position(
         dependent=then.dependent.scaled(1.0 - share) + now.dependent.scaled(share),
     )
     return CarriedPosition(at, before.reports + 1, interval_ns)
+
+
+def smoothed_interval_ns(before_ns: int, elapsed_ns: int) -> int:
+    """The smoothed time between two reports, with one more. Long ones count for no more than the
+    longest that is between the reports of a pair."""
+    return (before_ns + min(max(0, elapsed_ns), LONGEST_PAIR_NS)) // 2
 
 
 def _gain(before: Covariance2, of_both: Covariance2) -> Matrix:
@@ -91,10 +94,6 @@ def carried_to(then: ReportedPosition, now: ReportedPosition) -> ReportedPositio
     is too long, before it, or after a gap of the odometry."""
     if not (0 <= now.stamp_ns - then.stamp_ns <= LONGEST_NS and then.gaps == now.gaps):
         return None
-    motion = motion_between(then, now)
-    way_x, way_y, _ = motion.pose
-    heading = then.odometry_from_robot.heading + now.turn_rad
-    at = Pose2(then.x, then.y, heading) @ motion.pose
-    moved = motion.covariance.xx + (way_x * way_x + way_y * way_y) * now.turn_variance
+    at, moved = place_after(then, now)
     noise = then.noise + Covariance2(moved, 0.0, moved)
     return then._replace(x=at.x, y=at.y, noise=noise)

@@ -13,23 +13,15 @@ from msgspec.structs import replace
 
 from cpcbl_team.mean_offsets import FAST, MeanOffset, disagreement
 from cpcbl_team.sender_differences import ORIGIN, carried_differences, carried_positions
-from cpcbl_team.sender_records import (
-    OWN_SENSORS,
-    Rival,
-    SenderRecord,
-)
-from cpcbl_team.voters import SenderRecords, is_reporting
+from cpcbl_team.sender_records import Rival, SenderRecord
+from cpcbl_team.voters import SenderRecords, has_own_sensors, is_reporting
 
 CARRIED_CONFLICT: Final = 9.2
 """The same as `CONFLICT` for what senders said at different times (chi-square)."""
-REMEMBERED_NS: Final = 300_000_000_000  # a contest with a silent sender
+LONGEST_SILENCE_NS: Final = 300_000_000_000  # of a side of a contest: then it is forgotten
 AGREEMENT: Final = 6.0
-"""Two senders agree again if that makes their present difference so much more likely than the one
-of their contest (a difference of chi-squares)."""
-
-CLEAR_LEAD: Final = 6.0
-"""A third sender says the same as one of two if it is so much nearer to it (a difference of
-chi-squares)."""
+"""A sender says the same as one of the two sides of a contest, and not as the other one, if it is
+so much nearer to it (a difference of chi-squares). A side may say the same as the other again."""
 
 
 def open_rivals(senders: SenderRecords, name: str) -> tuple[Rival, ...]:
@@ -77,7 +69,7 @@ def contradicted_before(senders: SenderRecords, name: str, now_ns: int) -> tuple
     """The senders that said something else before, by their positions carried on until now, where
     no majority speaks for either. The robot may have been carried away since then, so this finds
     nobody wrong. Own sensors decide better."""
-    if _has_own_sensors(senders, now_ns):
+    if has_own_sensors(senders, now_ns):
         return ()
     differences = carried_differences(senders, name, now_ns).items()
     against = {n: d for n, d in differences if disagreement(ORIGIN, d) > CARRIED_CONFLICT}
@@ -92,16 +84,10 @@ def _witnesses(senders: SenderRecords, name: str, now_ns: int) -> list[MeanOffse
     return [place for n, place in places.items() if not senders[n].is_relay]
 
 
-def _has_own_sensors(senders: SenderRecords, now_ns: int) -> bool:
-    """Whether this robot's own sensors measured anything lately, whatever they agreed with."""
-    own = senders.get(OWN_SENSORS)
-    return own is not None and is_reporting(own, now_ns)
-
-
 def _is_decided(rival: Rival, others: Iterable[MeanOffset]) -> bool:
     """Whether more of the others say the same as a sender than as its rival, or fewer."""
     leads = [_lead(other, rival) for other in others if other.sender != rival.name]
-    for_it, against = (sum(sign * lead > CLEAR_LEAD for lead in leads) for sign in (1.0, -1.0))
+    for_it, against = (sum(sign * lead > AGREEMENT for lead in leads) for sign in (1.0, -1.0))
     return for_it != against
 
 
@@ -115,34 +101,39 @@ def with_mutual_contests(senders: SenderRecords, name: str, now_ns: int) -> Send
     """The records where those that said something else before are in a contest with this sender,
     also as long as they are silent."""
     known = {r.name for r in senders[name].rivals}
-    changed = {}
-    for rival in contradicted_before(senders, name, now_ns) if known else ():
-        other = senders[rival.name]
-        if rival.name in known and all(r.name != name for r in other.rivals):
-            back = (*other.rivals, Rival(name, -rival.x, -rival.y))
-            changed[rival.name] = replace(other, rivals=back)
+    found = contradicted_before(senders, name, now_ns) if known else ()
+    changed = _other_sides(senders, name, (r for r in found if r.name in known))
     return {**senders, **changed} if changed else senders
+
+
+def _other_sides(
+    senders: SenderRecords, name: str, rivals: Iterable[Rival]
+) -> dict[str, SenderRecord]:
+    """The records of the rivals of a sender that do not have this one as theirs yet, with it."""
+    changed = {}
+    for rival in rivals:
+        other = senders[rival.name]
+        if all(r.name != name for r in other.rivals):
+            back = Rival(name, -rival.x, -rival.y)
+            changed[rival.name] = replace(other, rivals=(*other.rivals, back))
+    return changed
 
 
 def with_silent_rivals(senders: SenderRecords, name: str, now_ns: int) -> SenderRecords:
     """The records where a sender that contradicts the estimate is in a contest with those that
     reported before and are silent now. Nobody else supports the estimate, so either they are wrong,
     or this one, or the robot was carried away. Own sensors tell which."""
-    if _has_own_sensors(senders, now_ns):
+    if has_own_sensors(senders, now_ns):
         return senders
-    changed, rivals = dict[str, SenderRecord](), {r.name: r for r in senders[name].rivals}
-    for other, d in carried_differences(senders, name, now_ns).items():
-        record = senders[other]
-        if other in rivals or is_reporting(record, now_ns):
-            continue
-        rivals[other] = Rival(other, d.x, d.y)
-        if all(r.name != name for r in record.rivals):
-            back = (*record.rivals, Rival(name, -d.x, -d.y))
-            changed[other] = replace(record, rivals=back)
-    if not changed:
+    record, known = senders[name], {r.name for r in senders[name].rivals}
+    new = [
+        Rival(n, d.x, d.y)
+        for n, d in carried_differences(senders, name, now_ns).items()
+        if n not in known and not is_reporting(senders[n], now_ns)
+    ]
+    if not (others := _other_sides(senders, name, new)):
         return senders
-    changed[name] = replace(senders[name], rivals=tuple(rivals.values()))
-    return {**senders, **changed}
+    return {**senders, **others, name: replace(record, rivals=(*record.rivals, *new))}
 
 
 def without_ended_contests(senders: SenderRecords, name: str, now_ns: int) -> SenderRecord:
@@ -154,21 +145,13 @@ def without_ended_contests(senders: SenderRecords, name: str, now_ns: int) -> Se
     if not record.rivals:
         return record
     found = carried_differences(senders, name, now_ns)
-    voting = [] if _has_own_sensors(senders, now_ns) else _witnesses(senders, name, now_ns)
+    voting = [] if has_own_sensors(senders, now_ns) else _witnesses(senders, name, now_ns)
     rivals = tuple(
         r
         for r in record.rivals
         if (other := senders.get(r.name)) is not None
-        and now_ns - other.last_report_ns <= REMEMBERED_NS
-        and not _is_over(r, found.get(r.name))
+        and now_ns - other.last_report_ns <= LONGEST_SILENCE_NS
+        and not ((now := found.get(r.name)) and _lead(now, r) > AGREEMENT)
         and not _is_decided(r, voting)
     )
     return record if rivals == record.rivals else replace(record, rivals=rivals)
-
-
-def _is_over(rival: Rival, now: MeanOffset | None) -> bool:
-    """Whether a present difference from a rival is clearly more likely if both agree again."""
-    if now is None:
-        return False
-    as_before = now._replace(x=now.x - rival.x, y=now.y - rival.y)
-    return disagreement(ORIGIN, as_before) - disagreement(ORIGIN, now) > AGREEMENT

@@ -5,7 +5,6 @@ from collections.abc import Iterable
 from itertools import product
 
 from cpcbl_team.estimate import Covariance3, Information, Sums
-from cpcbl_team.fusion import Observation
 from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.led_astray import gaps_of
 from cpcbl_team.mean_offsets import (
@@ -26,26 +25,23 @@ FARTHEST_OFFSET_M = 1.0  # of what a frame tells of the position, where it tells
 FARTHEST_M = 100.0  # the same of a sighting, which is to say nothing along an axis it does not tell
 
 
-def evidence_of_sighting(state: State, observation: Observation) -> OffsetEvidence:
-    """What a sighting of a teammate says about the offset of the estimate."""
-    dependent = observation.dependent
-    sums = observation.information(observation.noise(0.0))
+def evidence_of_sighting(state: State, sums: Sums, dependent: Covariance2) -> OffsetEvidence:
+    """What a sighting of a teammate says about the offset of the estimate: by its sums, without
+    the part of its noise that depends on the teammate's own pose."""
     variance = 0.5 * (dependent.xx + dependent.yy)
     return evidence_at(state, sums, Covariance2(variance, 0.0, variance))
 
 
 def position_by_sighting(
-    state: State, observation: Observation, errors: OdometryErrors
+    state: State, sums: Sums, dependent: Covariance2, errors: OdometryErrors
 ) -> ReportedPosition:
-    """Where a sighting of a teammate places this robot. The error of its heading is nearly the same
-    in the next sighting. `errors`: those of the odometry."""
-    evidence = observation.information(observation.noise(0.0))
-    (xx, xy, yy, *_), least = evidence[0], 1.0 / FARTHEST_M**2
+    """Where the same sighting places this robot. The error of its heading is nearly the same in the
+    next sighting. `errors`: those of the odometry."""
+    (xx, xy, yy, *_), least = sums[0], 1.0 / FARTHEST_M**2
     noise = Covariance2(xx + least, xy, yy + least).inverse()
     heading_variance = state.estimate.covariance.hh
-    (xx, xy, yy), (x, y) = about_position(evidence, heading_variance)
-    whole = Covariance2(xx + least, xy, yy + least).inverse()
-    cxx, cxy, cyy = whole
+    (xx, xy, yy), (x, y) = about_position(sums, heading_variance)
+    cxx, cxy, cyy = Covariance2(xx + least, xy, yy + least).inverse()
     of_heading = Covariance2(cxx - noise.xx, cxy - noise.xy, cyy - noise.yy)
     pose, odometry = state.estimate.pose, state.odometry_from_robot
     return ReportedPosition(
@@ -58,7 +54,7 @@ def position_by_sighting(
         gaps_of(state),
         errors,
         noise,
-        observation.dependent + of_heading,
+        dependent + of_heading,
         heading_variance,
     )
 

@@ -12,9 +12,8 @@ from typing import Final
 
 from cpcbl_team.estimate import Covariance3, Sums
 from cpcbl_team.gaussian import Covariance2
-from cpcbl_team.geometry import Pose2
 from cpcbl_team.mean_offsets import FadingOffsets, by_whole_noise, weighted
-from cpcbl_team.reported_tracks import ReportedPosition, motion_between
+from cpcbl_team.reported_tracks import ReportedPosition, place_after
 
 LONGEST_PAIR_NS: Final = 2_000_000_000  # between the two reports of a pair
 FADING_NS: Final = 3_000_000_000  # time constant with which pairs fade,
@@ -38,13 +37,9 @@ def with_pair(
     is_new = then.stamp_ns > sums.stamp_ns and now.stamp_ns > sums.stamp_ns
     if not (is_new and 0 <= elapsed_ns <= LONGEST_PAIR_NS and then.gaps == now.gaps):
         return sums
-    motion = motion_between(then, now)
-    way_x, way_y, _ = motion.pose
-    heading = then.odometry_from_robot.heading + now.turn_rad
-    expected = Pose2(then.x, then.y, heading) @ motion.pose
+    expected, variance = place_after(then, now)
     x, y = sign * (now.x - expected.x), sign * (now.y - expected.y)
-    turned = (way_x * way_x + way_y * way_y) * now.turn_variance
-    moved = motion.covariance.xx + turned + LEAST_VARIANCE
+    moved = variance + LEAST_VARIANCE
     noise = then.noise + now.noise + Covariance2(moved, 0.0, moved)
     dependent = then.dependent + now.dependent
     evidence, of_all = by_whole_noise(_sums(noise, x, y), dependent)

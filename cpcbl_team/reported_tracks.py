@@ -184,3 +184,13 @@ def motion_between(then: ReportedPosition, now: ReportedPosition) -> Estimate:
     along = SLIP_SHARE * SLIP_SHARE * squared + errors.distance_variance(distance)
     along += 0.25 * squared * turned
     return Estimate(way, Covariance3(along, 0.0, along, 0.0, 0.0, turned))
+
+
+def place_after(then: ReportedPosition, now: ReportedPosition) -> tuple[Pose2, float]:
+    """Where a reported position is at the time of another one, by odometry and the heading of the
+    estimate, and the variance (m^2, of each axis) that the way adds."""
+    motion = motion_between(then, now)
+    way_x, way_y, _ = motion.pose
+    heading = then.odometry_from_robot.heading + now.turn_rad
+    turned = (way_x * way_x + way_y * way_y) * now.turn_variance
+    return Pose2(then.x, then.y, heading) @ motion.pose, motion.covariance.xx + turned

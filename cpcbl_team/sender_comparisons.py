@@ -43,6 +43,7 @@ from cpcbl_team.voters import (
     RECENT_NS,
     SenderRecords,
     doubted_guests,
+    has_own_sensors,
     is_reporting,
     members,
     recent_senders,
@@ -156,8 +157,7 @@ def compare(senders: SenderRecords, name: str, now_ns: int) -> Comparison | None
 def _is_seeing(senders: SenderRecords, now_ns: int, of: int) -> bool:
     """Whether senders are compared with each other (DIRECT) by a robot whose own sensors measured
     anything lately. These say nothing of such differences, but no majority outweighs them."""
-    own = senders.get(OWN_SENSORS)
-    return of == DIRECT and own is not None and is_reporting(own, now_ns)
+    return of == DIRECT and has_own_sensors(senders, now_ns)
 
 
 def _sees(senders: SenderRecords, now_ns: int) -> bool:

@@ -1,6 +1,6 @@
 """How far apart senders say that this robot is, by pairs of their reports (`position_pairs.py`)."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Final
 
 from msgspec.structs import replace
@@ -17,9 +17,9 @@ from cpcbl_team.position_pairs import (
     with_pair,
 )
 from cpcbl_team.sender_records import SILENCE_NS, SenderRecord
+from cpcbl_team.voters import RECENT_NS
 
 REMEMBERED_NS: Final = 60_000_000_000  # older pairs are forgotten
-SILENT_NS: Final = 3_000_000_000
 MOST_PARTNERS: Final = 12  # with whose reports those of one sender are paired
 ORIGIN: Final = MeanOffset(0.0, 0.0, Covariance2(LEAST_VARIANCE, 0.0, LEAST_VARIANCE))
 """The mean position of a sender, about itself."""
@@ -107,17 +107,20 @@ def positions_about(
 
 
 def carried_positions(
-    senders: Mapping[str, SenderRecord], name: str, now_ns: int
+    senders: Mapping[str, SenderRecord],
+    name: str,
+    now_ns: int,
+    names: Collection[str] | None = None,
 ) -> dict[str, MeanOffset]:
-    """The positions by the other robots of the team minus that by this one, which has just reported
-    one. Guests have none: anybody may come as several of them."""
+    """The positions by the other robots of the team (None: by all) minus that by this one, which
+    has just reported one. Guests have none: anybody may come as several of them."""
     record = senders[name]
     own = record.carried
     if own is None or own.at.stamp_ns != now_ns or record.is_guest or not own.is_confirmed:
         return {}
     found = dict[str, MeanOffset]()
     for other, its in senders.items():
-        carried = its.carried
+        carried = its.carried if names is None or other in names else None
         if other == name or carried is None or its.reason is not None or its.is_guest:
             continue
         then = carried_to(carried.at, own.at) if carried.is_confirmed else None
@@ -135,16 +138,15 @@ def carried_differences(
 ) -> dict[str, MeanOffset]:
     """Those of them that tell more than means: either reports rarely, or the other one is silent,
     and they have no mean of pairs."""
-    found = carried_positions(senders, name, now_ns)
-    in_pairs = positions_about(senders, name, now_ns) if found else {}
-    is_rare = _is_rare(senders[name])
-    return {
-        other: mean
-        for other, mean in found.items()
-        if other not in in_pairs
-        and (is_rare or now_ns - mean.stamp_ns > SILENT_NS or _is_rare(senders[other]))
-    }
-
-
-def _is_rare(record: SenderRecord) -> bool:
-    return record.carried is not None and record.carried.is_rare
+    own = senders[name].carried
+    names = {
+        n
+        for n, r in senders.items()
+        if own is not None
+        and r.carried is not None
+        and (own.is_rare or r.carried.is_rare or now_ns - r.carried.at.stamp_ns > RECENT_NS)
+    } - {name}
+    if not names:
+        return {}
+    in_pairs = positions_about(senders, name, now_ns).keys()
+    return carried_positions(senders, name, now_ns, names - in_pairs)

@@ -19,7 +19,11 @@ from typing import Final, NamedTuple
 import msgspec
 from msgspec.structs import replace
 
-from cpcbl_team.carried_positions import CarriedPosition, with_reported_position
+from cpcbl_team.carried_positions import (
+    CarriedPosition,
+    smoothed_interval_ns,
+    with_reported_position,
+)
 from cpcbl_team.estimate import Sums
 from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.mean_headings import COURSE_VARIANCE, NO_TURNS, FadingTurns
@@ -33,7 +37,7 @@ from cpcbl_team.mean_offsets import (
     by_whole_noise,
     weighted,
 )
-from cpcbl_team.position_pairs import LONGEST_PAIR_NS, NO_PAIRS, PositionPairs
+from cpcbl_team.position_pairs import NO_PAIRS, PositionPairs
 from cpcbl_team.reported_tracks import ReportedPosition, ReportedTrack, cusum, with_reported
 
 SILENCE_NS: Final = 10_000_000_000  # earlier reports count no longer after this silence
@@ -188,12 +192,15 @@ def with_report(record: SenderRecord, report: TeammateReport, limit: float) -> S
     if record.score and report.stamp_ns - record.last_report_ns > SILENCE_NS:
         record = replace(record, score=0.0)
     record = _with_position(_with_faded_conflicts(record, report.stamp_ns), report.position)
-    last_ns, own_nis = max(record.last_report_ns, report.stamp_ns), report.own_nis
-    record = replace(record, last_report_ns=last_ns, is_guest=report.is_guest, own_nis=own_nis)
-    record = replace(record, is_relay=report.is_relay)
     at = report.position or report.seen_at
-    if at is not None:
-        record = replace(record, carried=with_reported_position(record.carried, at))
+    record = replace(
+        record,
+        last_report_ns=max(record.last_report_ns, report.stamp_ns),
+        is_guest=report.is_guest,
+        is_relay=report.is_relay,
+        own_nis=report.own_nis,
+        carried=record.carried if at is None else with_reported_position(record.carried, at),
+    )
     if report.nis is None:
         return record
     if report.heading is not None:
@@ -306,8 +313,7 @@ def _smoothed_interval_ns(record: SenderRecord, now_ns: int) -> int:
     """The smoothed time between two reported positions, with one more."""
     if record.last_position is None:
         return record.interval_ns
-    elapsed_ns = max(0, now_ns - record.last_position.stamp_ns)
-    return (record.interval_ns + min(elapsed_ns, LONGEST_PAIR_NS)) // 2
+    return smoothed_interval_ns(record.interval_ns, now_ns - record.last_position.stamp_ns)
 
 
 def is_in_conflict(record: SenderRecord, began_ns: int) -> bool:

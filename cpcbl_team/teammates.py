@@ -129,11 +129,13 @@ class TeammateScreen:
                 freedom = sum(len(found.constraints) for found in objects)
                 of_two = 2.0 * sum(found.nis for found in objects) / freedom
                 if first.observation:
-                    of_it = evidence_of_sighting(state, first.observation)
+                    seen = first.observation
+                    sums, dependent = seen.information(seen.noise(0.0)), seen.dependent
+                    of_it = evidence_of_sighting(state, sums, dependent)
                     evidence = with_camera(state, first.measurement, of_it)
                     if is_teammate:
                         errors = self._odometry_errors
-                        seen_at = position_by_sighting(state, first.observation, errors)
+                        seen_at = position_by_sighting(state, sums, dependent, errors)
             report = TeammateReport(
                 now,
                 of_two,

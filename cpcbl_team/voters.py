@@ -31,6 +31,12 @@ def recent_senders(
             yield name, r
 
 
+def has_own_sensors(senders: SenderRecords, now_ns: int) -> bool:
+    """Whether this robot's own sensors measured anything lately, whatever they agreed with."""
+    own = senders.get(OWN_SENSORS)
+    return own is not None and is_reporting(own, now_ns)
+
+
 def senders_with_a_say(senders: SenderRecords, name: str, now_ns: int) -> SenderRecords:
     """The recent senders that count in a dispute about a report of `name`."""
     silenced = {*doubted_guests(senders, now_ns)} - {name}

@@ -22,7 +22,7 @@ from cpcbl_team.carried_positions import (
 )
 from cpcbl_team.contests import (
     AGREEMENT,
-    REMEMBERED_NS,
+    LONGEST_SILENCE_NS,
     contest_m,
     contest_of_sources_m,
     open_rivals,
@@ -204,7 +204,7 @@ def test_a_contest_lasts_while_nothing_tells_and_ends_when_both_agree_again() ->
 def test_a_contest_with_a_robot_that_left_for_good_is_forgotten() -> None:
     """Or else one chance would leave a robot uncertain for ever."""
     senders = in_turn({"west": 0.0, "east": 1.0})
-    long_s = REMEMBERED_NS / SECOND
+    long_s = LONGEST_SILENCE_NS / SECOND
     for at_s, left in ((long_s - 1.0, {"west"}), (long_s + 10.0, set())):
         senders = heard(senders, "east", reported(at_s, 1.0))
         assert rivals(senders)["east"] == left
