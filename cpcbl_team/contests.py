@@ -85,10 +85,12 @@ def _witnesses(senders: SenderRecords, name: str, now_ns: int) -> list[MeanOffse
 
 
 def _is_decided(rival: Rival, others: Iterable[MeanOffset]) -> bool:
-    """Whether more of the others say the same as a sender than as its rival, or fewer."""
+    """Whether more of the others say the same as a sender than as its rival, or fewer, also if all
+    that are too vague to say either spoke for the other side."""
     leads = [_lead(other, rival) for other in others if other.sender != rival.name]
-    for_it, against = (sum(sign * lead > AGREEMENT for lead in leads) for sign in (1.0, -1.0))
-    return for_it != against
+    for_it, against = (sum(sign * lead > AGREEMENT for lead in leads) for sign in (1, -1))
+    vague = len(leads) - for_it - against
+    return abs(for_it - against) > vague
 
 
 def _lead(other: MeanOffset, rival: Rival) -> float:
@@ -139,19 +141,22 @@ def with_silent_rivals(senders: SenderRecords, name: str, now_ns: int) -> Sender
 def without_ended_contests(senders: SenderRecords, name: str, now_ns: int) -> SenderRecord:
     """The record of a sender without those rivals with which it agrees again by their positions
     carried on until now: a difference of zero is clearly more likely than that of their contest.
-    Nor is a rival remembered if most others speak for one of both, as if it still said the same, or
-    if it has been silent for very long: it may never come back."""
+    Nor is one of these remembered if most others speak for one of both, as if it still said the
+    same, nor one that has been silent for very long: it may never come back."""
     record = senders[name]
     if not record.rivals:
         return record
     found = carried_differences(senders, name, now_ns)
-    voting = [] if has_own_sensors(senders, now_ns) else _witnesses(senders, name, now_ns)
-    rivals = tuple(
-        r
-        for r in record.rivals
-        if (other := senders.get(r.name)) is not None
-        and now_ns - other.last_report_ns <= LONGEST_SILENCE_NS
-        and not ((now := found.get(r.name)) and _lead(now, r) > AGREEMENT)
-        and not _is_decided(r, voting)
-    )
+    sees = has_own_sensors(senders, now_ns)
+    voting = [] if sees or not found else _witnesses(senders, name, now_ns)
+
+    def is_over(rival: Rival) -> bool:
+        other, now = senders.get(rival.name), found.get(rival.name)
+        if other is None or now_ns - other.last_report_ns > LONGEST_SILENCE_NS:
+            return True
+        if now is None:
+            return False
+        return _lead(now, rival) > AGREEMENT or _is_decided(rival, voting)
+
+    rivals = tuple(rival for rival in record.rivals if not is_over(rival))
     return record if rivals == record.rivals else replace(record, rivals=rivals)

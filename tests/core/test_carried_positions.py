@@ -229,6 +229,18 @@ def test_a_third_robot_ends_a_contest_though_one_side_is_silent() -> None:
     assert rivals(senders) == {"west": set(), "east": set(), "north": set()}
 
 
+def test_two_of_four_end_no_contest_while_one_is_too_vague_to_take_a_side() -> None:
+    """Two liars that agreed with each other quarantined a correct robot, because the other correct
+    one was vague: 71 % inside 3 sigma."""
+    senders = in_turn({"west": 0.0, "east": 1.0})
+    for t in range(20, 25):
+        senders = heard(senders, "south", reported(float(t), 0.0, sigma_m=1.0))
+    for t in range(30, 40):
+        senders = heard(senders, "north", reported(float(t), 1.0, sigma_m=0.2))
+        senders = heard(senders, "east", reported(t + 0.5, 1.0, sigma_m=0.2))
+    assert rivals(senders)["east"] == {"west"}
+
+
 def test_two_that_report_often_are_compared_by_their_means() -> None:
     senders: Records = {}
     for i in range(40):
