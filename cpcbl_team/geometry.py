@@ -13,6 +13,12 @@ TAU: Final = math.tau
 new: Final = tuple.__new__  # new(Pose2, (x, y, h)) takes half the time of Pose2(x, y, h)
 
 
+def phase(z: complex) -> float:
+    """The angle (rad) of a complex number. (`cmath.phase` raises an error where it is so small that
+    it is rounded to zero.)"""
+    return math.atan2(z.imag, z.real)
+
+
 def wrap_angle(angle: float) -> float:
     """The same angle within [-pi, pi]."""
     if -PI <= angle <= PI:

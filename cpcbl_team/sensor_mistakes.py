@@ -13,7 +13,7 @@ from typing import Final, NamedTuple
 
 from cpcbl_team.estimate import POSE, Estimate, FilteredOffset, offset_pose
 from cpcbl_team.fusion import chi_square_bound
-from cpcbl_team.geometry import Pose2
+from cpcbl_team.geometry import Pose2, phase
 from cpcbl_team.relocalization import (
     OUTLIER,
     PropagatedEvidence,
@@ -139,7 +139,7 @@ def _without(mistake: SensorMistake, e: Evidence, now: Pose2, place: Pose2) -> E
     scale = abs(real) / abs(seen)
     range_m = None if e.range_m is None else scale * e.range_m
     return e._replace(
-        range_m=range_m, bearing_rad=cmath.phase(real), range_sigma_m=scale * e.range_sigma_m
+        range_m=range_m, bearing_rad=phase(real), range_sigma_m=scale * e.range_sigma_m
     )
 
 

@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.core import angles, coordinates, poses
 
-from cpcbl_team.geometry import Pose2, step, wrap_angle
+from cpcbl_team.geometry import Pose2, phase, step, wrap_angle
 
 
 def same_pose(a: Pose2, b: Pose2) -> bool:
@@ -18,6 +18,12 @@ def test_a_wrapped_angle_is_the_same_direction_within_half_a_turn(angle: float) 
     assert abs(wrapped) <= math.pi
     assert math.cos(wrapped) == pytest.approx(math.cos(angle), abs=1e-9)
     assert math.sin(wrapped) == pytest.approx(math.sin(angle), abs=1e-9)
+
+
+def test_the_phase_of_a_number_beside_the_axis_is_zero() -> None:
+    """`cmath.phase` raises an OverflowError there: a driver's bearing may be so small."""
+    assert phase(complex(3.0, 5e-324)) == 0.0
+    assert phase(complex(0.0, -2.0)) == -0.5 * math.pi
 
 
 @given(poses)

@@ -19,7 +19,7 @@ from typing import NamedTuple
 from cpcbl_agents.input_diagnosis.rays import ray_error
 from cpcbl_team import sensor_mistakes as mistakes
 from cpcbl_team.config import Landmark
-from cpcbl_team.geometry import Pose2
+from cpcbl_team.geometry import Pose2, phase
 from cpcbl_team.inputs import Odometry, Sighting, Sightings
 
 LEAST_CASES = 5
@@ -208,7 +208,7 @@ def fixed_errors(
     driven = [b[0] - a[0] for a, b in ends]
     driven = driven if sign > 0 else [d.conjugate() for d in driven]
     seen = [r.before - r.after for r in resightings]
-    fitted = cmath.phase(sum(p * d.conjugate() for p, d in zip(seen, driven, strict=True)) or 1.0)
+    fitted = phase(sum(p * d.conjugate() for p, d in zip(seen, driven, strict=True)) or 1.0)
     turned = cmath.rect(1.0, fitted)
     return [_error(r, d * turned, r.after) for r, d in zip(resightings, driven, strict=True)]
 

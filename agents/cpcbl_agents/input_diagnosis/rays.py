@@ -1,7 +1,8 @@
 """Where a landmark may be seen again of which only the bearing is known: on a ray, at any range."""
 
-import cmath
 import math
+
+from cpcbl_team.geometry import phase
 
 NEAREST_M = 0.2
 
@@ -16,7 +17,7 @@ def ray_error(before: complex, after: complex, displacement: complex) -> float:
     far = before - displacement
     near = before / abs(before) * NEAREST_M - displacement
     direction = after / abs(after)
-    from_near, from_far = (cmath.phase(direction * end.conjugate()) for end in (near, far))
+    from_near, from_far = (phase(direction * end.conjugate()) for end in (near, far))
     if from_near * from_far <= 0.0 and abs(from_near - from_far) < math.pi:
         return 0.0
     return min(abs(from_near), abs(from_far))

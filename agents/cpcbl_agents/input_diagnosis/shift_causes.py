@@ -27,6 +27,7 @@ from cpcbl_agents.input_diagnosis.motion_causes import (
 )
 from cpcbl_agents.input_diagnosis.start_causes import bearings_off
 from cpcbl_team.config import Landmark, OdometryNoise, SensorSettings
+from cpcbl_team.geometry import phase
 from cpcbl_team.inputs import Sightings
 from cpcbl_team.sensor_mistakes import FOOT_M
 
@@ -193,7 +194,7 @@ def _of_gain(shift: Shift, steps: Sequence[Step]) -> str:
     ]
     if found:
         return min(found)[1]
-    angle = cmath.phase(shift.gain)
+    angle = phase(shift.gain)
     if abs(angle) > LEAST_BIAS_RAD and shift.sigmas_from(cmath.rect(1.0, angle)) < NEAR_SIGMAS:
         return bearings_off(angle)
     return ""

@@ -11,7 +11,7 @@ from statistics import median
 
 from cpcbl_agents.input_diagnosis.motion_causes import OR_START, Step, place_of, poses_at
 from cpcbl_team.config import Landmark
-from cpcbl_team.geometry import Pose2
+from cpcbl_team.geometry import Pose2, phase
 from cpcbl_team.inputs import Sightings
 
 LEAST_VIEWS = 8
@@ -36,8 +36,8 @@ def turned_view_cause(
     headings = [heading for heading, _ in views]
     if max(headings) - min(headings) < LEAST_TURN_RAD:
         return ""
-    middle = cmath.phase(sum(off for _, off in views))
-    aside = [cmath.phase(off * cmath.rect(1.0, -middle)) for _, off in views]
+    middle = phase(sum(off for _, off in views))
+    aside = [phase(off * cmath.rect(1.0, -middle)) for _, off in views]
     off_rad = math.remainder(middle + median(aside), math.tau)
     near = sum(abs(a - median(aside)) < SPREAD_RAD for a in aside)
     if near < SHARE * len(views) or abs(off_rad) < LEAST_OFF_RAD:
