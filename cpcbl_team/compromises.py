@@ -15,13 +15,15 @@ from cpcbl_team.estimate import Covariance3, Estimate
 from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.mean_offsets import ALTERNATING_NS, FAST, bias_variance
 from cpcbl_team.sender_records import NEVER_NS, NO_EVIDENCE, OWN_SENSORS, Rival
-from cpcbl_team.voters import SenderRecords, recent_senders
+from cpcbl_team.silent_sensors import is_contested
+from cpcbl_team.voters import RECENT_NS, SenderRecords
 
 MOST_BEHIND: Final = 20.0  # a difference of chi-squares beyond which a side has no weight
 CLEAR: Final = 0.73  # of the more likely side, by a difference of chi-squares of 2
 FRESH_NS: Final = 500_000_000  # a sender stands for what it says for so long after a report
 DOUBTED: Final = 6.0  # difference of chi-squares
 DOUBTED_M: Final = 0.3
+EVEN: Final = 0.5  # the probability of either side where nothing tells which one is right
 LEAST_DOUBT: Final = 0.1  # the least probability of a side, for what the robot reports of itself
 
 
@@ -99,12 +101,18 @@ def _opponents(senders: SenderRecords, name: str) -> list[Rival]:
 
 
 def with_contest(estimate: Estimate, senders: SenderRecords, now_ns: int) -> Estimate:
-    """The estimate, as uncertain as the sides of a contest are apart between which it is."""
-    spreads = [
-        found.spread
-        for name, _ in recent_senders(senders, now_ns, OWN_SENSORS)
-        if (found := compromise(senders, name)) is not None
-    ]
+    """The estimate, as uncertain as the sides of a contest are apart between which it is, or as
+    teammates are from it that say that the robot is elsewhere."""
+    spreads = list[Covariance2]()
+    for name, record in senders.items():
+        if record.reason is not None:
+            continue
+        if is_contested(senders, name, now_ns):
+            x, y = record.overruled_m
+            spreads.append(Covariance2(EVEN * x * x, EVEN * x * y, EVEN * y * y))
+        elif now_ns - record.last_report_ns <= RECENT_NS:
+            found = compromise(senders, name) if name != OWN_SENSORS else None
+            spreads += [found.spread] if found else []
     if not spreads:
         return estimate
     xx, xy, yy = max(spreads, key=lambda spread: spread.xx + spread.yy)

@@ -14,7 +14,7 @@ from msgspec.structs import replace
 from cpcbl_team.mean_offsets import FAST, MeanOffset, disagreement
 from cpcbl_team.sender_differences import ORIGIN, carried_differences, carried_positions
 from cpcbl_team.sender_records import Rival, SenderRecord
-from cpcbl_team.voters import SenderRecords, has_own_sensors, is_reporting
+from cpcbl_team.voters import SenderRecords, is_reporting, knows_by_itself
 
 CARRIED_CONFLICT: Final = 9.2
 """The same as `CONFLICT` for what senders said at different times (chi-square)."""
@@ -69,7 +69,7 @@ def contradicted_before(senders: SenderRecords, name: str, now_ns: int) -> tuple
     """The senders that said something else before, by their positions carried on until now, where
     no majority speaks for either. The robot may have been carried away since then, so this finds
     nobody wrong. Own sensors decide better."""
-    if has_own_sensors(senders, now_ns):
+    if knows_by_itself(senders, now_ns):
         return ()
     differences = carried_differences(senders, name, now_ns).items()
     against = {n: d for n, d in differences if disagreement(ORIGIN, d) > CARRIED_CONFLICT}
@@ -125,7 +125,7 @@ def with_silent_rivals(senders: SenderRecords, name: str, now_ns: int) -> Sender
     """The records where a sender that contradicts the estimate is in a contest with those that
     reported before and are silent now. Nobody else supports the estimate, so either they are wrong,
     or this one, or the robot was carried away. Own sensors tell which."""
-    if has_own_sensors(senders, now_ns):
+    if knows_by_itself(senders, now_ns):
         return senders
     record, known = senders[name], {r.name for r in senders[name].rivals}
     new = [
@@ -147,8 +147,8 @@ def without_ended_contests(senders: SenderRecords, name: str, now_ns: int) -> Se
     if not record.rivals:
         return record
     found = carried_differences(senders, name, now_ns)
-    sees = has_own_sensors(senders, now_ns)
-    voting = [] if sees or not found else _witnesses(senders, name, now_ns)
+    knows = knows_by_itself(senders, now_ns)
+    voting = [] if knows or not found else _witnesses(senders, name, now_ns)
 
     def is_over(rival: Rival) -> bool:
         other, now = senders.get(rival.name), found.get(rival.name)

@@ -29,10 +29,14 @@ from cpcbl_team.sender_records import (
 from cpcbl_team.state import State
 from cpcbl_team.voters import SenderRecords, reporting_senders
 
-FADING_NS: Final = 20_000_000_000  # time constant with which evidence fades
+FADING_NS: Final = 20_000_000_000  # time constant with which evidence fades,
+OLD_FADING_NS: Final = (
+    120_000_000_000  # and without hypotheses: then nothing new speaks for anybody
+)
 HELD_NS: Final = 10_000_000_000  # hypotheses are kept for so long after the last contradiction
 MOST_GAIN: Final = 6.0  # one frame counts for no more than this difference of chi-squares,
 MOST_EVIDENCE: Final = 30.0  # and all together for no more, so that a change is noticed soon
+LEAST_EVIDENCE: Final = 0.5  # less is forgotten
 SUSPICIOUS_M: Final = 0.05  # a possible bias of this size is looked into
 MOST_HYPOTHESES: Final = 12
 
@@ -103,6 +107,18 @@ def with_gains(
         if record.behind and name not in gains:
             found[name] = replace(record, behind=NO_EVIDENCE)
     return found
+
+
+def with_faded_gains(senders: SenderRecords, before_ns: int, now_ns: int) -> SenderRecords:
+    """The records while there are no hypotheses: what own readings said of earlier ones fades."""
+    if not any(record.behind for record in senders.values()):
+        return senders
+    fade = math.exp((before_ns - now_ns) / OLD_FADING_NS)
+    kept = {
+        name: {n: fade * b for n, b in record.behind.items() if abs(b) > LEAST_EVIDENCE}
+        for name, record in senders.items()
+    }
+    return {name: replace(record, behind=kept[name]) for name, record in senders.items()}
 
 
 def at_compromise(

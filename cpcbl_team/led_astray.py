@@ -8,7 +8,7 @@ last reports of senders, then these led the estimate astray: they are quarantine
 goes on from its own pose.
 """
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Final
 
 from msgspec.structs import replace
@@ -19,9 +19,10 @@ from cpcbl_team.config import OdometrySettings
 from cpcbl_team.estimate import Estimate, Sums, pose_difference
 from cpcbl_team.fusion import Observation, mark_shared, merge_split
 from cpcbl_team.gaussian import Covariance2
-from cpcbl_team.hypotheses import with_gains, with_hypotheses
+from cpcbl_team.hypotheses import with_faded_gains, with_gains, with_hypotheses
 from cpcbl_team.mean_offsets import FAST_COMMON_M
 from cpcbl_team.measurements import GatedObject
+from cpcbl_team.own_errors import reset_scores
 from cpcbl_team.own_pose import OwnPose
 from cpcbl_team.own_pose_conflicts import own_pose_conflict
 from cpcbl_team.parameters import Sensitivity, sensitivity_dot
@@ -42,7 +43,6 @@ from cpcbl_team.state import (
     with_memory,
     with_teammates,
 )
-from cpcbl_team.trust import reset_scores
 from cpcbl_team.voters import SenderRecords
 
 GUESSED_NS: Final = 100_000_000  # odometry that is missing for longer does not only come late
@@ -64,7 +64,7 @@ class OwnPoses:
         when help comes first, and after a gap of the odometry."""
         own = self._present(state, with_hypotheses=True)
         if own is None:
-            return with_own_pose(state, self._new_own_pose(state))
+            return self._begun_anew(state)
         readings = () if self._common is None else self._common.own_readings(accepted)
         return self._updated(state, own, sums, readings)
 
@@ -87,12 +87,14 @@ class OwnPoses:
 
         teammates = state.memory.teammates
         senders, by_sender = teammates.senders, own.by_sender
+        before_ns = own.stamp_ns if teammates.own is None else teammates.own.stamp_ns
         if by_sender:
-            before_ns = own.stamp_ns if teammates.own is None else teammates.own.stamp_ns
             gains = {n: log_likelihood(pose) for n, pose in by_sender.items()}
             gains[OWN_SENSORS] = log_likelihood(own)
             senders = with_gains(senders, gains, before_ns, state.stamp_ns)
             by_sender = {name: after(pose) for name, pose in by_sender.items()}
+        else:
+            senders = with_faded_gains(senders, before_ns, state.stamp_ns)
         own = with_hypotheses(after(own)._replace(by_sender=by_sender), senders)
         return with_teammates(state, teammates._replace(senders=senders, own=own))
 
@@ -130,7 +132,7 @@ class OwnPoses:
         the estimate away."""
         own = self._present(state, with_hypotheses=True)
         if own is None:
-            return with_own_pose(state, self._new_own_pose(state)) if is_accepted else state
+            return self._begun_anew(state) if is_accepted else state
         if _nis(own, state, position) > self._gate:
             return state
         readings = () if self._common is None else self._common.position_readings(position)
@@ -206,11 +208,20 @@ class OwnPoses:
         """A pose at the time of the state, by odometry."""
         return own.at(state.stamp_ns, state.memory.calibration.scales)
 
-    def _new_own_pose(self, state: State) -> OwnPose:
-        """The pose by own sensors where it begins: the estimate."""
-        known = state.memory.calibration
+    def _begun_anew(self, state: State) -> State:
+        """The state where the pose by own sensors begins, as the estimate."""
+        teammates, known, now_ns = state.memory.teammates, state.memory.calibration, state.stamp_ns
         estimate, gaps = mark_shared(state.estimate), gaps_of(state)
-        return OwnPose(state.stamp_ns, estimate, known.adaptation, gaps, known.common)
+        own = OwnPose(now_ns, estimate, known.adaptation, gaps, known.common)
+        senders = teammates.senders
+        if teammates.own is not None:
+            senders = with_faded_gains(senders, teammates.own.stamp_ns, now_ns)
+        return with_teammates(state, teammates._replace(senders=senders, own=own))
+
+    def compared(self, state: State) -> Collection[str]:
+        """The senders of which own readings judge hypotheses at present."""
+        own = state.memory.teammates.own
+        return () if own is None or own.is_old(state.stamp_ns) else own.by_sender
 
 
 def distance_squared(estimate: Estimate, own: Estimate) -> float:

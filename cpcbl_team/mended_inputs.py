@@ -3,8 +3,8 @@
 from cpcbl_team.estimate import Covariance3, Estimate
 from cpcbl_team.geometry import Pose2, new, wrap_angle
 from cpcbl_team.inputs import InputsMended
+from cpcbl_team.own_errors import forgive
 from cpcbl_team.state import State, with_recovery, with_senders, with_teammates
-from cpcbl_team.trust import forgive
 
 
 def with_mended_inputs(state: State, event: InputsMended) -> State:

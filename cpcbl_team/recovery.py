@@ -32,6 +32,7 @@ from cpcbl_team.miscalibration import (
     Adaptation,
     noise_with_factor,
 )
+from cpcbl_team.own_errors import forget_reports, reset_scores
 from cpcbl_team.recovery_evidence import WINDOW_NS, latest
 from cpcbl_team.relocalization import are_apart, readings_of, relocalize
 from cpcbl_team.sender_differences import without_pairs
@@ -41,6 +42,7 @@ from cpcbl_team.sensor_mistakes import (
     is_mirror_image,
     mirrored,
 )
+from cpcbl_team.silent_sensors import OUTNUMBERED_NS
 from cpcbl_team.state import (
     FIX,
     Evidence,
@@ -49,7 +51,6 @@ from cpcbl_team.state import (
     with_common_errors,
     with_recovery,
 )
-from cpcbl_team.trust import forget_reports, reset_scores
 from cpcbl_team.trusted_pose import (
     agrees,
     expected_pose,
@@ -58,7 +59,7 @@ from cpcbl_team.trusted_pose import (
     trusted_pose,
     with_jump,
 )
-from cpcbl_team.voters import SenderRecords
+from cpcbl_team.voters import BELIEVED_NS, SenderRecords, own_agreement_ns
 
 INFLATION_NS: Final = 1_000_000_000
 DOUBT_NS: Final = 5_000_000_000  # wrong inputs are named before they move a robot elsewhere
@@ -150,6 +151,9 @@ class Recovery:
         if rejected < UNCONFIRMED:
             return ""
         evidence = self._evidence_since(state, since_ns)
+        believes = state.stamp_ns - own_agreement_ns(state.senders) <= BELIEVED_NS
+        if believes and all(e.from_teammate for e in evidence):
+            return ""  # own sensors overrule them
         objects = len({e.source for e in evidence})
         if objects == 1 and all(e.bearing_rad is None for e in evidence):
             least = UNCONFIRMED
@@ -167,9 +171,8 @@ class Recovery:
         there are none."""
         if state.updates.innovations & (1 << UNCONFIRMED) - 1:
             return ""
-        evidence = self._evidence_since(state, state.stamp_ns - WINDOW_NS)
         names = united_majority(state.memory.teammates.senders, state.stamp_ns)
-        if not names or any(not e.from_teammate for e in evidence):
+        if not names or state.stamp_ns - own_agreement_ns(state.senders) <= OUTNUMBERED_NS:
             return ""
         return f"{' and '.join(names)} contradict it, and agree"
 
@@ -271,7 +274,7 @@ class Recovery:
                 common=None if common is None else common.uncorrelated(),
             ),
         )
-        updates = state.updates._replace(innovations=1)
+        updates = state.updates._replace(innovations=1, objects_ns={})  # of the former estimate
         return state._replace(estimate=self._reduce(estimate), updates=updates, memory=memory)
 
     def evidence(

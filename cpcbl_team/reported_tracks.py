@@ -73,6 +73,10 @@ class ReportedPosition(NamedTuple):
     dependent: Covariance2 = NOTHING  # and that which all reports of its sender have in common
     turn_variance: float = 0.0  # rad^2, of `turn_rad`
 
+    def minus(self, pose: Pose2) -> tuple[float, float]:
+        """Its offset (m) from the position of a pose."""
+        return self.x - pose.x, self.y - pose.y
+
 
 class ReportedTrack(NamedTuple):
     """The poses of this robot by the reports of one sender, and by odometry."""

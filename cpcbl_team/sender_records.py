@@ -11,7 +11,7 @@ What follows from them, and from the mean of the reports (`mean_offsets.py`), is
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from enum import StrEnum
 from types import MappingProxyType
 from typing import Final, NamedTuple
@@ -103,18 +103,18 @@ class TeammateReport(NamedTuple):
     stamp_ns: int
     nis: float | None
     """Scaled to two degrees of freedom; None if the robot is lost, so that there is no test 1."""
-    offset: tuple[float, float] | None = None
-    """The reported position minus the estimated one, m; None for a sighting."""
+    offset: tuple[float, float] | None = None  # from the estimate (m); None for a sighting
     position: ReportedPosition | None = None  # for test 2; None for a sighting
     evidence: OffsetEvidence | None = None
     """For the mean of its reports; None for what has no part in it."""
     is_guest: bool = False  # whether its sender is no robot of the team
     heading: tuple[float, float] | None = None
     """The reported heading minus the estimated one, rad, and its variance; None without one."""
-    own_nis: float = 0.0
-    """Against the pose by own sensors, scaled like `nis`; 0 without one."""
+    own_nis: float = 0.0  # against the pose by own sensors, scaled like `nis`; 0 without one
     is_relay: bool = False  # whether its sender knows its place by what others tell it only
-    seen_at: ReportedPosition | None = None  # where a sighting of its sender places this robot
+    seen_at: ReportedPosition | None = None  # where a sighting of its sender places this robot,
+    seen_offset: tuple[float, float] | None = None  # and that minus the estimated position, m
+    compared: Collection[str] = ()  # the senders of which own readings judge hypotheses
 
 
 class Rival(NamedTuple):
@@ -181,6 +181,8 @@ class SenderRecord(msgspec.Struct, frozen=True, gc=False):
     """How much more likely other senders make the robot's own readings than this one does, where
     they contradict it (`hypotheses.py`): differences of chi-squares, by name."""
     confirmed: int = 0  # reports beside which another source agreed with it
+    overruled_ns: int = NEVER_NS  # when own sensors that are silent last overruled its report,
+    overruled_m: tuple[float, float] = (0.0, 0.0)  # and how far from the estimate that was, m
     is_guest: bool = False
     is_relay: bool = False
     headings: FadingTurns = NO_TURNS  # that it reported
@@ -225,6 +227,7 @@ def without_comparisons(record: SenderRecord) -> SenderRecord:
         means=new.means,
         behind=new.behind,
         denial=new.denial,
+        overruled_ns=new.overruled_ns,
         headings=new.headings,
         courses=new.courses,
     )
@@ -285,7 +288,7 @@ def _with_position(record: SenderRecord, now: ReportedPosition | None) -> Sender
     track = with_reported(record.track, now)
     record = replace(record, track=track, last_position=now, interval_ns=interval_ns)
     if then is None or now.stamp_ns - then.stamp_ns > SILENCE_NS:
-        return replace(record, position=now)
+        return replace(record, position=now, confirmations=0)
     if now.stamp_ns <= then.stamp_ns:
         return record
     reported, driven, sigma = distances_between(then, now)

@@ -24,7 +24,8 @@ from cpcbl_team.miscalibration import with_doubts
 from cpcbl_team.own_pose import OwnPose
 from cpcbl_team.pose_mixtures import PoseMixture
 from cpcbl_team.scale_errors import with_scales_doubted
-from cpcbl_team.sender_records import SenderRecord
+from cpcbl_team.sender_records import NEVER_NS, SenderRecord
+from cpcbl_team.silent_sensors import with_own_agreement
 
 FIX = "fix:"  # marks the source of an active fix, apart from a sighting of that teammate
 _NONE: Mapping[str, Any] = MappingProxyType({})
@@ -213,9 +214,8 @@ class State(NamedTuple):
         estimate = with_arc_width(self.estimate) if mixture is None else mixture.whole()
         estimate = with_doubts(estimate, known.check)
         estimate = with_scales_doubted(estimate, known.scales)
-        teammates = self.memory.teammates
-        if teammates.own is not None and teammates.own.by_sender:
-            estimate = with_contest(estimate, teammates.senders, self.stamp_ns)
+        if self.memory.teammates.senders:
+            estimate = with_contest(estimate, self.senders, self.stamp_ns)
         return with_doubt(estimate, self.odometry_from_robot, known.filters, known.adaptation)
 
     @property
@@ -227,6 +227,13 @@ class State(NamedTuple):
     def lost(self) -> str:
         """Why the robot is lost; empty if it is not."""
         return self.memory.recovery.lost
+
+    @property
+    def senders(self) -> Mapping[str, SenderRecord]:
+        """The records of all senders, with when own sensors last agreed with the estimate."""
+        known, objects = self.memory.teammates.senders, self.updates.objects_ns.items()
+        own = (ns for name, ns in objects if name not in known and not name.startswith(FIX))
+        return with_own_agreement(known, max(own, default=NEVER_NS))
 
     @property
     def has_no_heading(self) -> bool:

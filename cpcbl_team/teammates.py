@@ -46,6 +46,7 @@ from cpcbl_team.sender_records import (
     OffsetEvidence,
     TeammateReport,
 )
+from cpcbl_team.silent_sensors import is_on_trial
 from cpcbl_team.state import State, with_memory, with_senders, with_teammates
 from cpcbl_team.voters import LEAST_CONFIRMED, RECENT_NS, SenderRecords, voters
 
@@ -143,12 +144,16 @@ class TeammateScreen:
                 is_guest=self._is_guest(sender),
                 is_relay=sender in self._relays,
                 seen_at=seen_at,
+                seen_offset=seen_at and seen_at.minus(state.estimate.pose),
+                compared=self.own.compared(state),
             )
             if first.observation:
                 report = report._replace(own_nis=self.own.nis_of_sighting(state, first))
                 of_first = first.observation, self._rules.least_sigma_m, first.sensitivities
                 state = self.own.after_report(state, sender, *of_first)
             state, is_trusted = self._assess(state, sender, report, first.measurement.source)
+            if not is_fresh and not state.lost:  # it was not tested
+                is_trusted &= not is_on_trial(state.memory.teammates.senders, sender, now)
             if not is_trusted:
                 distrusted.add(sender)
         if not all(is_teammate for _, is_teammate in reports):  # used now, whenever it was said
@@ -265,6 +270,7 @@ class TeammateScreen:
             of_heading,
             self.own.nis(state, position),
             is_relay=observation.sender in self._relays,
+            compared=self.own.compared(state),
         )
         of_it = observation.sender, position, self._rules.least_sigma_m
         state = self.own.after_report(state, *of_it)
@@ -303,7 +309,7 @@ class TeammateScreen:
     ) -> tuple[State, bool]:
         """The state after a report of a teammate, and whether the report may be used."""
         memory, estimate = state.memory, state.estimate
-        senders, used_ns = memory.teammates.senders, state.updates.objects_ns.get(source)
+        senders, used_ns = state.senders, state.updates.objects_ns.get(source)
         before_ns = NEVER_NS if used_ns is None else used_ns
         decision = trust.assess(senders, sender, report, before_ns, self._rules)
         if decision.event:

@@ -54,6 +54,7 @@ from cpcbl_team.sender_records import (
     BY_COMPARISON,
     CONTRADICTING_NIS,
     MOST_NIS,
+    NO_EVIDENCE,
     OWN_SENSORS,
     SILENCE_NS,
     OffsetEvidence,
@@ -69,11 +70,18 @@ from cpcbl_team.sender_records import (
     with_report,
     without_comparisons,
 )
+from cpcbl_team.silent_sensors import (
+    are_silent,
+    believes_own_sensors,
+    overruled,
+    stays_overruled,
+)
 from cpcbl_team.voters import (
     RECENT_NS,
     SenderRecords,
     is_left_out_guest,
     members,
+    own_agreement_ns,
     recent_senders,
     reporting_senders,
     senders_with_a_say,
@@ -99,17 +107,6 @@ class TrustDecision(NamedTuple):
     estimate_error_m: float = 0.0  # how far the estimate may be off because it followed them
     estimate_error_rad: float = 0.0  # the same of its heading
     least_sigma_m: float = 0.0  # of the estimate, while senders contradict each other
-
-
-class TrustStatus(NamedTuple):
-    """How far this robot trusts a sender, for its status message."""
-
-    robot: str
-    reason: str = ""
-    since_ns: int = 0
-    quarantines: int = 0
-    unconfirmed: bool = False  # it is the only recent sender, so a bias of it cannot be detected
-    contested: bool = False  # it contradicts others, and nobody can decide who is right
 
 
 def with_own_sensor_result(
@@ -173,16 +170,22 @@ def _decide(
         return _quarantine(senders, name, now, used_ns)
     if report.nis is None:
         return TrustDecision(senders, True)
+    believes = believes_own_sensors(senders, now, rules.limit)
+    if believes and stays_overruled(senders, name, report):
+        return _overruled(senders, name, report)
     if comparison is not None and comparison.is_wrong:  # suspicion is no accusation yet
         if now - record.wrong_ns < PERSISTENCE_NS:
             return TrustDecision(senders, False)
         return _quarantine_by_mean(senders, name, now)
     if comparison is not None and (comparison.is_contested or record.score > 0.5 * rules.limit):
-        # Others do not contradict it, so rather the estimate is wrong.
+        # Others do not contradict it, so rather the estimate is wrong, or own sensors are silent.
+        is_silent = are_silent(senders, record.dispute_since_ns, now)
+        if record.score > rules.limit and is_silent and believes:
+            return _overruled(senders, name, report)
         mean = record.means[FAST]
         least_m = 0.0 if mean is None else mean.length_m
         return TrustDecision(senders, not comparison.is_left_out, least_sigma_m=least_m)
-    return _decide_dispute(senders, name, now, used_ns, rules)
+    return _decide_dispute(senders, name, report, used_ns, rules)
 
 
 def _quarantine_by_mean(senders: SenderRecords, name: str, now_ns: int) -> TrustDecision:
@@ -207,11 +210,13 @@ def _quarantine_by_mean(senders: SenderRecords, name: str, now_ns: int) -> Trust
 
 
 def _decide_dispute(
-    senders: SenderRecords, name: str, now_ns: int, used_ns: int, rules: TrustSettings
+    senders: SenderRecords, name: str, report: TeammateReport, used_ns: int, rules: TrustSettings
 ) -> TrustDecision:
     """Decides who is wrong if a sender has contradicted the estimate for long enough. A source
     supports the estimate only if the estimate followed it after the dispute began. If none does, no
-    sender is blamed: the robot detects by its innovations that it is lost."""
+    sender is blamed: the robot detects by its innovations that it is lost, but not by one teammate
+    while it believes its own sensors."""
+    now_ns = report.stamp_ns
     bound = score_bound(senders, rules.limit)
     is_dispute = any(r.score > bound for r in senders.values())
     recent = senders_with_a_say(senders, name, now_ns) if is_dispute else {}
@@ -221,17 +226,21 @@ def _decide_dispute(
     began_ns = min(disputes_ns)
     dissenters = dissenting(recent, rules.limit) | supporters_of_dissent(recent, bound)
     supporters = supporters_of_estimate(recent, dissenters, bound, began_ns)
+    is_silent = are_silent(senders, began_ns, now_ns)
+    believes = is_silent and believes_own_sensors(senders, now_ns, rules.limit)
     if not supporters:
-        if name in dissenters:
-            senders = with_silent_rivals(senders, name, now_ns)
-        return TrustDecision(senders, True)
+        if name not in dissenters:
+            return TrustDecision(senders, True)
+        if believes:
+            return _overruled(senders, name, report)
+        return TrustDecision(with_silent_rivals(senders, name, now_ns), True)
     rivals = {r.name for n in dissenters for r in open_rivals(senders, n)}
-    if not rivals.isdisjoint(supporters) or any(_is_open(senders[n]) for n in dissenters):
+    if not rivals.isdisjoint(supporters) or any(_is_open(senders, n, report) for n in dissenters):
         return TrustDecision(senders, True)  # they are compared by other tests
     is_only_of_team = not members(recent, supporters) and len(members(recent, dissenters)) == 1
     if is_only_of_team and OWN_SENSORS not in dissenters | supporters:
         return _without_decision(TrustDecision(senders, True), dissenters, now_ns)
-    is_right = _is_estimate_right(recent, dissenters, supporters, began_ns, now_ns)
+    is_right = _is_estimate_right(recent, dissenters, supporters, began_ns, now_ns, believes)
     if is_right is None:
         if now_ns - began_ns < TIE_NS:
             return TrustDecision(senders, False)
@@ -243,13 +252,25 @@ def _decide_dispute(
     return TrustDecision(senders, name not in dissenters)
 
 
+def _overruled(senders: SenderRecords, name: str, report: TeammateReport) -> TrustDecision:
+    """The decision that own sensors overrule a sender, though they are silent."""
+    changed = {**senders, name: overruled(senders, name, report)}
+    return TrustDecision(changed, False)
+
+
 def _is_estimate_right(
-    recent: SenderRecords, dissenters: set[str], supporters: set[str], began_ns: int, now_ns: int
+    recent: SenderRecords,
+    dissenters: set[str],
+    supporters: set[str],
+    began_ns: int,
+    now_ns: int,
+    believes_own_sensors: bool,
 ) -> bool | None:
     """Whether the estimate and its supporters are right; None while that is undecided. The robot's
-    own sensors decide, otherwise odometry, otherwise the majority, and after some time the estimate
-    before the dispute. One distance that odometry contradicts, perhaps by chance, takes no vote
-    from the last robot of the team beside guests."""
+    own sensors decide, otherwise odometry, otherwise the majority, in which silent own sensors have
+    a vote (`believes_own_sensors`), and after some time the estimate before the dispute.
+    One distance that odometry contradicts, perhaps by chance, takes no vote from the last robot of
+    the team beside guests."""
     if OWN_SENSORS in supporters or OWN_SENSORS in dissenters:
         return OWN_SENSORS in supporters
     all_sides = dissenters | supporters
@@ -258,6 +279,7 @@ def _is_estimate_right(
     if rest and (members(recent, rest) or not members(recent, all_sides)):
         dissenters, supporters = dissenters - conflicting, supporters - conflicting
     for_it, against = (votes(recent, side, all_sides) for side in (supporters, dissenters))
+    for_it += believes_own_sensors
     if for_it != against:
         return for_it > against
     is_sudden = all(_is_guest_or_agreed(recent[n], began_ns) for n in dissenters)
@@ -271,10 +293,11 @@ def _is_guest_or_agreed(record: SenderRecord, began_ns: int) -> bool:
     return record.is_guest or began_ns - record.last_agreement_ns <= SILENCE_NS
 
 
-def _is_open(record: SenderRecord) -> bool:
+def _is_open(senders: SenderRecords, name: str, report: TeammateReport) -> bool:
     """Whether own readings are compared with what this sender reports, and do not speak clearly
     against it."""
-    return bool(record.behind) and max(record.behind.values()) <= EVIDENCE_ON_MOST
+    behind = senders[name].behind if name in report.compared else NO_EVIDENCE
+    return bool(behind) and max(behind.values()) <= EVIDENCE_ON_MOST
 
 
 def _is_odometry_wrong(senders: SenderRecords, name: str, rules: TrustSettings) -> bool:
@@ -352,46 +375,11 @@ def _assess_quarantined(
         senders = {**senders, name: record}
     wrong_ns = max(record.last_failure_ns, record.since_ns)
     agrees = record.agreements >= LEAST_AGREEMENTS and now - wrong_ns >= readmit_ns
-    is_alone = all(now - r.last_report_ns > SILENCE_NS for n, r in senders.items() if n != name)
+    is_alone = now - own_agreement_ns(senders) > SILENCE_NS and all(
+        now - r.last_report_ns > SILENCE_NS for n, r in senders.items() if n != name
+    )
     has_confirmations = record.confirmations >= LEAST_CONFIRMATIONS
     is_consistent = has_confirmations and now - record.last_conflict_ns >= readmit_ns
     if not ((agrees and is_confirmed) or (is_alone and is_consistent)):
         return TrustDecision(senders, False)
     return TrustDecision({**senders, name: readmitted(record, now)}, True, "readmitted")
-
-
-def reset_scores(senders: SenderRecords) -> SenderRecords:
-    """The records after the robot was lost: its own error caused the scores of test 1, and another
-    estimate has replaced that with which the reports were compared."""
-    reset = {n: r if r.reason else replace(r, score=0.0) for n, r in senders.items()}
-    return {n: without_comparisons(r) for n, r in reset.items()}
-
-
-def forgive(senders: SenderRecords, now_ns: int, since_ns: int = 0) -> SenderRecords:
-    """The records after the robot found an error of its own, which it has had since then: what
-    disagreed with its estimate may have been right. An older quarantine has another cause, unless
-    nobody else is left: then the error began before it was found."""
-    blamed = {n: r for n, r in senders.items() if r.reason in BY_COMPARISON}
-    caused = {n for n, r in blamed.items() if r.since_ns >= since_ns}
-    if all(r.reason and n not in caused for n, r in senders.items()):
-        caused = set(blamed)
-    return {
-        n: released(r, now_ns) if n in caused else replace(r, score=0.0) for n, r in senders.items()
-    }
-
-
-def forget_reports(senders: SenderRecords, now_ns: int) -> SenderRecords:
-    """The same, where another estimate has replaced that with which the reports were compared."""
-    return {n: without_comparisons(r) for n, r in forgive(senders, now_ns).items()}
-
-
-def trust_statuses(senders: SenderRecords, now_ns: int) -> tuple[TrustStatus, ...]:
-    """The status of each sender that reported recently, or is or was in quarantine."""
-    statuses = []
-    for name, r in sorted(senders.items()):
-        if name != OWN_SENSORS and (r.quarantines or now_ns - r.last_report_ns <= RECENT_NS):
-            is_only = not any(recent_senders(senders, now_ns, name))
-            is_contested = not r.reason and bool(open_rivals(senders, name))
-            fields = str(r.reason or ""), r.since_ns, r.quarantines, is_only, is_contested
-            statuses.append(TrustStatus(name, *fields))
-    return tuple(statuses)

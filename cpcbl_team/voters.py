@@ -4,9 +4,10 @@ for anybody may come as several of them."""
 from collections.abc import Collection, Iterator, Mapping
 from typing import Final
 
-from cpcbl_team.sender_records import OWN_SENSORS, SILENCE_NS, SenderRecord
+from cpcbl_team.sender_records import NEVER_NS, OWN_SENSORS, SILENCE_NS, SenderRecord
 
 RECENT_NS: Final = 3_000_000_000  # a sender takes part in disputes for so long after a report
+BELIEVED_NS: Final = 60_000_000_000  # for so long own sensors overrule a teammate while silent
 LEAST_CONFIRMED: Final = 20  # reports of a guest with which others agreed, until it is proven
 DOUBT_NS: Final = 60_000_000_000  # for so long new guests have the doubt about earlier ones
 SenderRecords = Mapping[str, SenderRecord]
@@ -35,6 +36,23 @@ def has_own_sensors(senders: SenderRecords, now_ns: int) -> bool:
     """Whether this robot's own sensors measured anything lately, whatever they agreed with."""
     own = senders.get(OWN_SENSORS)
     return own is not None and is_reporting(own, now_ns)
+
+
+def own_agreement_ns(senders: SenderRecords) -> int:
+    """When this robot's own sensors last agreed with its estimate."""
+    own = senders.get(OWN_SENSORS)
+    return NEVER_NS if own is None else own.last_agreement_ns
+
+
+def believes_odometry(senders: SenderRecords, now_ns: int) -> bool:
+    """Whether own sensors agreed with the estimate so lately that this robot believes to be where
+    odometry led it since."""
+    return now_ns - own_agreement_ns(senders) <= BELIEVED_NS
+
+
+def knows_by_itself(senders: SenderRecords, now_ns: int) -> bool:
+    """Whether own sensors tell, or told lately, which of two teammates is right."""
+    return has_own_sensors(senders, now_ns) or believes_odometry(senders, now_ns)
 
 
 def senders_with_a_say(senders: SenderRecords, name: str, now_ns: int) -> SenderRecords:

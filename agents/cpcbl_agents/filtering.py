@@ -36,7 +36,7 @@ from cpcbl_team.places import map_object
 from cpcbl_team.self_calibration import SelfCalibration
 from cpcbl_team.sensors import recalibrated
 from cpcbl_team.timeline import OWN_SENSORS, Timeline
-from cpcbl_team.trust import TrustStatus, trust_statuses
+from cpcbl_team.trust_status import TrustStatus, trust_statuses
 from cpcbl_transport.messages import Help, LandmarkEstimate, input_name
 
 REPORT_INTERVAL_NS = 100_000_000
@@ -124,7 +124,7 @@ class FilterAgent:
 
     def trust_statuses(self, now_ns: int) -> tuple[TrustStatus, ...]:
         """How far this robot trusts each teammate from which it receives help."""
-        return trust_statuses(self.timeline.state.memory.teammates.senders, now_ns)
+        return trust_statuses(self.timeline.state.senders, now_ns)
 
     def handle(self, message: AgentMessage, now_ns: int) -> Sequence[AgentMessage]:
         match message:

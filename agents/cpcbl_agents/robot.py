@@ -47,7 +47,7 @@ from cpcbl_team.inputs import (
 from cpcbl_team.landmark_claims import LandmarkClaims
 from cpcbl_team.lost_reasons import rejected_of
 from cpcbl_team.state import Jump, pose_of
-from cpcbl_team.trust import TrustStatus
+from cpcbl_team.trust_status import TrustStatus
 from cpcbl_transport.budget import Budget
 from cpcbl_transport.messages import Flow, Help, Message, Outgoing, Pose, SensorInput, Status, Trust
 

@@ -33,7 +33,8 @@ from cpcbl_team.mean_offsets import NOTHING
 from cpcbl_team.reported_tracks import ReportedPosition
 from cpcbl_team.sender_differences import carried_differences
 from cpcbl_team.sender_records import OWN_SENSORS, SenderRecord, TeammateReport
-from cpcbl_team.trust import assess, trust_statuses
+from cpcbl_team.trust import assess
+from cpcbl_team.trust_status import trust_statuses
 
 Records = Mapping[str, SenderRecord]
 

@@ -20,6 +20,7 @@ from cpcbl_team.geometry import Pose2
 from cpcbl_team.inflation import inflate_to
 from cpcbl_team.inputs import BeliefShared
 from cpcbl_team.mean_offsets import FadingOffsets, MeanOffset
+from cpcbl_team.own_errors import reset_scores
 from cpcbl_team.sender_records import (
     OWN_SENSORS,
     OffsetEvidence,
@@ -28,7 +29,8 @@ from cpcbl_team.sender_records import (
     TeammateReport,
     with_report,
 )
-from cpcbl_team.trust import assess, reset_scores, trust_statuses
+from cpcbl_team.trust import assess
+from cpcbl_team.trust_status import trust_statuses
 
 NOW_NS = 100 * SECOND
 Records = dict[str, SenderRecord]

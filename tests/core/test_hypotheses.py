@@ -219,7 +219,7 @@ def test_a_dispute_is_decided_where_own_readings_speak_clearly_against_the_sende
     )
     senders = {"liar": liar, "honest": says(0.0), OWN_SENSORS: says(0.0)}
     senders = {n: r if r is liar else agreeing(r) for n, r in senders.items()}
-    report = TeammateReport(NOW_NS, 50.0, (0.7, 0.0))
+    report = TeammateReport(NOW_NS, 50.0, (0.7, 0.0), compared=("liar", "honest"))
     decision = assess(senders, "liar", report, since_ns, RULES)
     assert decision.quarantined == ({"liar"} if is_found else set())
 

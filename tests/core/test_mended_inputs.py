@@ -9,10 +9,10 @@ from support.core import SECOND
 from cpcbl_team.config import Field, LocalizationSettings, Start
 from cpcbl_team.inputs import InputsMended
 from cpcbl_team.localizer import Localizer
+from cpcbl_team.own_errors import forgive
 from cpcbl_team.sender_records import QuarantineReason, SenderRecord
 from cpcbl_team.state import with_senders, with_teammates
 from cpcbl_team.timeline import Timeline
-from cpcbl_team.trust import forgive
 
 
 def test_the_heading_turns_the_covariance_grows_and_teammates_are_forgiven() -> None:

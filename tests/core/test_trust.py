@@ -24,7 +24,8 @@ from cpcbl_team.sender_records import (
     SenderRecord,
     TeammateReport,
 )
-from cpcbl_team.trust import assess, trust_statuses
+from cpcbl_team.trust import assess
+from cpcbl_team.trust_status import trust_statuses
 
 
 @pytest.fixture

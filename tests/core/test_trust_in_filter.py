@@ -35,7 +35,7 @@ from cpcbl_team.inputs import Odometry, Sighting, Sightings
 from cpcbl_team.localizer import Localizer
 from cpcbl_team.state import State
 from cpcbl_team.timeline import Timeline
-from cpcbl_team.trust import trust_statuses
+from cpcbl_team.trust_status import trust_statuses
 
 
 @cache

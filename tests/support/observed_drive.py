@@ -71,7 +71,9 @@ class Drive:
         rules: TrustSettings = RULES,
         rounds: int = 2,
         claimed_m: float = 0.05,
+        hidden_s: tuple[float, float] = (0.0, 0.0),
     ) -> None:
+        """`hidden_s`: from when to when it sees no landmarks."""
         rng = np.random.default_rng(seed)
         self.robot = localizer(
             variant,
@@ -90,7 +92,8 @@ class Drive:
             inputs: list[Input] = [
                 Odometry(piece.from_ns, piece.stamp_ns, distance, piece.turn_rad)
             ]
-            if sees_landmarks:
+            is_hidden = hidden_s[0] * SECOND <= piece.stamp_ns < hidden_s[1] * SECOND
+            if sees_landmarks and not is_hidden:
                 inputs.append(frame(truth, piece.stamp_ns, noise=noise))
             for name, observed in observers.items():
                 position = observed(piece.stamp_ns, truth, rng)
