@@ -16,7 +16,7 @@ from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.mean_offsets import ALTERNATING_NS, FAST, bias_variance
 from cpcbl_team.sender_records import NEVER_NS, NO_EVIDENCE, OWN_SENSORS, Rival
 from cpcbl_team.silent_sensors import is_contested
-from cpcbl_team.voters import RECENT_NS, SenderRecords
+from cpcbl_team.voters import SenderRecords, is_reporting
 
 MOST_BEHIND: Final = 20.0  # a difference of chi-squares beyond which a side has no weight
 CLEAR: Final = 0.73  # of the more likely side, by a difference of chi-squares of 2
@@ -61,8 +61,12 @@ def compromise(senders: SenderRecords, name: str) -> Compromise | None:
     if share > 1.0 - CLEAR and not is_heard:
         return None
     doubt = max(share * (1.0 - share), LEAST_DOUBT * (1.0 - LEAST_DOUBT))
-    spread = Covariance2(doubt * x * x, doubt * x * y, doubt * y * y)
-    return Compromise(share * x, share * y, spread, share > CLEAR)
+    return Compromise(share * x, share * y, _spread(doubt, x, y), share > CLEAR)
+
+
+def _spread(doubt: float, x: float, y: float) -> Covariance2:
+    """The covariance of two places that are so far apart, times this share."""
+    return Covariance2(doubt * x * x, doubt * x * y, doubt * y * y)
 
 
 def doubt_variance(senders: SenderRecords, name: str) -> float:
@@ -105,14 +109,10 @@ def with_contest(estimate: Estimate, senders: SenderRecords, now_ns: int) -> Est
     teammates are from it that say that the robot is elsewhere."""
     spreads = list[Covariance2]()
     for name, record in senders.items():
-        if record.reason is not None:
-            continue
-        if is_contested(senders, name, now_ns):
-            x, y = record.overruled_m
-            spreads.append(Covariance2(EVEN * x * x, EVEN * x * y, EVEN * y * y))
-        elif now_ns - record.last_report_ns <= RECENT_NS:
-            found = compromise(senders, name) if name != OWN_SENSORS else None
-            spreads += [found.spread] if found else []
+        if record.reason is None and is_contested(senders, name, now_ns):
+            spreads.append(_spread(EVEN, *record.overruled_m))
+        elif is_reporting(record, now_ns) and (found := compromise(senders, name)):
+            spreads.append(found.spread)
     if not spreads:
         return estimate
     xx, xy, yy = max(spreads, key=lambda spread: spread.xx + spread.yy)

@@ -59,7 +59,7 @@ from cpcbl_team.trusted_pose import (
     trusted_pose,
     with_jump,
 )
-from cpcbl_team.voters import BELIEVED_NS, SenderRecords, own_agreement_ns
+from cpcbl_team.voters import SenderRecords, believes_odometry, own_agreement_ns
 
 INFLATION_NS: Final = 1_000_000_000
 DOUBT_NS: Final = 5_000_000_000  # wrong inputs are named before they move a robot elsewhere
@@ -151,7 +151,7 @@ class Recovery:
         if rejected < UNCONFIRMED:
             return ""
         evidence = self._evidence_since(state, since_ns)
-        believes = state.stamp_ns - own_agreement_ns(state.senders) <= BELIEVED_NS
+        believes = believes_odometry(state.senders, state.stamp_ns)
         if believes and all(e.from_teammate for e in evidence):
             return ""  # own sensors overrule them
         objects = len({e.source for e in evidence})

@@ -36,25 +36,28 @@ def with_own_agreement(senders: SenderRecords, stamp_ns: int) -> SenderRecords:
     return {**senders, OWN_SENSORS: replace(own, last_agreement_ns=stamp_ns)}
 
 
-def believes_own_sensors(senders: SenderRecords, now_ns: int, limit: float) -> bool:
-    """Whether own sensors that agreed with the estimate a while ago overrule those who say that the
+def own_sensors_overrule(senders: SenderRecords, began_ns: int, now_ns: int, limit: float) -> bool:
+    """Whether own sensors that take no side in a dispute that began then decide it all the same:
+    they have not agreed with the estimate since, or not lately, but before."""
+    own_ns = own_agreement_ns(senders)
+    is_silent = own_ns <= began_ns or now_ns - own_ns > RECENT_NS
+    return is_silent and _are_believed(senders, now_ns, limit)
+
+
+def _are_believed(senders: SenderRecords, now_ns: int, limit: float) -> bool:
+    """Whether own sensors that agreed with the estimate a while ago outweigh those who say that the
     robot is elsewhere: with a score of test 1 of more than half of this limit."""
+    if not believes_odometry(senders, now_ns):
+        return False
     against = {
         name
         for name, record in recent_senders(senders, now_ns)
         if record.score > 0.5 * limit or was_overruled(record, now_ns)
     }
-    if OWN_SENSORS in against or not believes_odometry(senders, now_ns):
+    if OWN_SENSORS in against:
         return False
     is_one = len(members(senders, against)) < LEAST_UNITED
     return is_one or now_ns - own_agreement_ns(senders) <= OUTNUMBERED_NS
-
-
-def are_silent(senders: SenderRecords, began_ns: int, now_ns: int) -> bool:
-    """Whether own sensors take no side in a dispute that began then, because they have not agreed
-    with the estimate since, or not lately."""
-    own_ns = own_agreement_ns(senders)
-    return own_ns <= began_ns or now_ns - own_ns > RECENT_NS
 
 
 def overruled(senders: SenderRecords, name: str, report: TeammateReport) -> SenderRecord:
@@ -87,13 +90,21 @@ def is_on_trial(senders: SenderRecords, name: str, now_ns: int) -> bool:
     return was_overruled(record, now_ns) and own_agreement_ns(senders) > record.overruled_ns
 
 
-def stays_overruled(senders: SenderRecords, name: str, report: TeammateReport) -> bool:
+def stays_overruled(
+    senders: SenderRecords, name: str, report: TeammateReport, limit: float
+) -> bool:
     """Whether own sensors have not told yet whether a sender is right that they overruled. It has
     no say meanwhile, also where the estimate is too uncertain to contradict it."""
+    return _awaits_own_sensors(senders, name, report) and _are_believed(
+        senders, report.stamp_ns, limit
+    )
+
+
+def _awaits_own_sensors(senders: SenderRecords, name: str, report: TeammateReport) -> bool:
     record = senders[name]
     if record.overruled_ns > own_agreement_ns(senders):  # they have measured nothing since
         return True
-    if report.stamp_ns - record.overruled_ns > RECENT_NS or report.evidence is None:
+    if not was_overruled(record, report.stamp_ns) or report.evidence is None:
         return False
     x, y = record.overruled_m
     return CLEAR_SIGMAS**2 * report.evidence.position_variance > x * x + y * y

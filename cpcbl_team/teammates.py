@@ -153,7 +153,8 @@ class TeammateScreen:
                 state = self.own.after_report(state, sender, *of_first)
             state, is_trusted = self._assess(state, sender, report, first.measurement.source)
             if not is_fresh and not state.lost:  # it was not tested
-                is_trusted &= not is_on_trial(state.memory.teammates.senders, sender, now)
+                senders = state.memory.teammates.senders
+                is_trusted = is_trusted and not is_on_trial(senders, sender, now)
             if not is_trusted:
                 distrusted.add(sender)
         if not all(is_teammate for _, is_teammate in reports):  # used now, whenever it was said

@@ -70,12 +70,7 @@ from cpcbl_team.sender_records import (
     with_report,
     without_comparisons,
 )
-from cpcbl_team.silent_sensors import (
-    are_silent,
-    believes_own_sensors,
-    overruled,
-    stays_overruled,
-)
+from cpcbl_team.silent_sensors import overruled, own_sensors_overrule, stays_overruled
 from cpcbl_team.voters import (
     RECENT_NS,
     SenderRecords,
@@ -170,8 +165,7 @@ def _decide(
         return _quarantine(senders, name, now, used_ns)
     if report.nis is None:
         return TrustDecision(senders, True)
-    believes = believes_own_sensors(senders, now, rules.limit)
-    if believes and stays_overruled(senders, name, report):
+    if stays_overruled(senders, name, report, rules.limit):
         return _overruled(senders, name, report)
     if comparison is not None and comparison.is_wrong:  # suspicion is no accusation yet
         if now - record.wrong_ns < PERSISTENCE_NS:
@@ -179,8 +173,8 @@ def _decide(
         return _quarantine_by_mean(senders, name, now)
     if comparison is not None and (comparison.is_contested or record.score > 0.5 * rules.limit):
         # Others do not contradict it, so rather the estimate is wrong, or own sensors are silent.
-        is_silent = are_silent(senders, record.dispute_since_ns, now)
-        if record.score > rules.limit and is_silent and believes:
+        is_dispute, began_ns = record.score > rules.limit, record.dispute_since_ns
+        if is_dispute and own_sensors_overrule(senders, began_ns, now, rules.limit):
             return _overruled(senders, name, report)
         mean = record.means[FAST]
         least_m = 0.0 if mean is None else mean.length_m
@@ -226,12 +220,11 @@ def _decide_dispute(
     began_ns = min(disputes_ns)
     dissenters = dissenting(recent, rules.limit) | supporters_of_dissent(recent, bound)
     supporters = supporters_of_estimate(recent, dissenters, bound, began_ns)
-    is_silent = are_silent(senders, began_ns, now_ns)
-    believes = is_silent and believes_own_sensors(senders, now_ns, rules.limit)
+    own_vote = own_sensors_overrule(senders, began_ns, now_ns, rules.limit)
     if not supporters:
         if name not in dissenters:
             return TrustDecision(senders, True)
-        if believes:
+        if own_vote:
             return _overruled(senders, name, report)
         return TrustDecision(with_silent_rivals(senders, name, now_ns), True)
     rivals = {r.name for n in dissenters for r in open_rivals(senders, n)}
@@ -240,7 +233,7 @@ def _decide_dispute(
     is_only_of_team = not members(recent, supporters) and len(members(recent, dissenters)) == 1
     if is_only_of_team and OWN_SENSORS not in dissenters | supporters:
         return _without_decision(TrustDecision(senders, True), dissenters, now_ns)
-    is_right = _is_estimate_right(recent, dissenters, supporters, began_ns, now_ns, believes)
+    is_right = _is_estimate_right(recent, dissenters, supporters, began_ns, now_ns, own_vote)
     if is_right is None:
         if now_ns - began_ns < TIE_NS:
             return TrustDecision(senders, False)
@@ -264,11 +257,11 @@ def _is_estimate_right(
     supporters: set[str],
     began_ns: int,
     now_ns: int,
-    believes_own_sensors: bool,
+    own_vote: bool,
 ) -> bool | None:
     """Whether the estimate and its supporters are right; None while that is undecided. The robot's
-    own sensors decide, otherwise odometry, otherwise the majority, in which silent own sensors have
-    a vote (`believes_own_sensors`), and after some time the estimate before the dispute.
+    own sensors decide, otherwise odometry, otherwise the majority, in which own sensors that are
+    silent may have a vote for it (`own_vote`), and after some time the estimate before the dispute.
     One distance that odometry contradicts, perhaps by chance, takes no vote from the last robot of
     the team beside guests."""
     if OWN_SENSORS in supporters or OWN_SENSORS in dissenters:
@@ -279,7 +272,7 @@ def _is_estimate_right(
     if rest and (members(recent, rest) or not members(recent, all_sides)):
         dissenters, supporters = dissenters - conflicting, supporters - conflicting
     for_it, against = (votes(recent, side, all_sides) for side in (supporters, dissenters))
-    for_it += believes_own_sensors
+    for_it += own_vote
     if for_it != against:
         return for_it > against
     is_sudden = all(_is_guest_or_agreed(recent[n], began_ns) for n in dissenters)

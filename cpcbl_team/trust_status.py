@@ -5,7 +5,7 @@ from typing import NamedTuple
 from cpcbl_team.contests import open_rivals
 from cpcbl_team.sender_records import OWN_SENSORS
 from cpcbl_team.silent_sensors import is_contested
-from cpcbl_team.voters import RECENT_NS, SenderRecords, recent_senders
+from cpcbl_team.voters import SenderRecords, is_reporting, recent_senders
 
 
 class TrustStatus(NamedTuple):
@@ -23,7 +23,7 @@ def trust_statuses(senders: SenderRecords, now_ns: int) -> tuple[TrustStatus, ..
     """The status of each sender that reported recently, or is or was in quarantine."""
     statuses = []
     for name, r in sorted(senders.items()):
-        if name != OWN_SENSORS and (r.quarantines or now_ns - r.last_report_ns <= RECENT_NS):
+        if name != OWN_SENSORS and (r.quarantines or is_reporting(r, now_ns)):
             is_only = not any(recent_senders(senders, now_ns, name))
             is_open = bool(open_rivals(senders, name)) or is_contested(senders, name, now_ns)
             fields = str(r.reason or ""), r.since_ns, r.quarantines, is_only
