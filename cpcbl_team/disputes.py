@@ -106,14 +106,17 @@ def supporters_of_estimate(
 ) -> set[str]:
     """The sources that the estimate followed since a dispute began, because they never contradicted
     it clearly, and that do not agree as well with what the senders say whose score is beyond the
-    `bound`. One that differs from the estimate by less leads it on."""
+    `bound`. One that differs from the estimate by less leads it on. Own sensors alone do not say
+    where the robot is instead, so nobody denies that."""
     parties = {n: r for n, r in recent.items() if r.score > bound}
+    if parties.keys() <= {OWN_SENSORS}:
+        return set()
     return {
         name
         for name, r in recent.items()
         if name not in dissenters
         and r.last_accepted_ns > began_ns > r.last_failure_ns
-        and _denies(r, parties)
+        and _denies(r, parties, is_own=name == OWN_SENSORS)
     }
 
 
@@ -124,7 +127,7 @@ def supporters_of_dissent(recent: SenderRecords, bound: float) -> set[str]:
     return {
         name
         for name, r in recent.items()
-        if (denied := _denied(r, parties)) is not None and denied < -USUAL
+        if name != OWN_SENSORS and (denied := _denied(r, parties)) is not None and denied < -USUAL
     }
 
 
@@ -138,18 +141,19 @@ def _denied(record: SenderRecord, parties: SenderRecords) -> float | None:
     return None
 
 
-def _denies(record: SenderRecord, parties: SenderRecords) -> bool:
+def _denies(record: SenderRecord, parties: SenderRecords, is_own: bool) -> bool:
     """Whether a source is nearer to the estimate than to what these senders say, by more than usual
-    noise. A source that is too vague to tell agrees with both sides. One without reports since the
-    dispute began is judged by its mean, and one without a mean by its single reports."""
-    denied = _denied(record, parties)
-    if denied is not None:
+    noise. A source that is too vague to tell agrees with both sides. Own sensors are judged by
+    their mean, if they have one; others, and own sensors that measure rarely, by their reports
+    since the dispute began; one without such reports by its mean or its single reports. A sender
+    that was only seen says no place that could be denied."""
+    claims = [r.mean_offset for r in parties.values()]
+    denied, mean = _denied(record, parties), record.means[FAST]
+    if denied is not None and not (is_own and (mean or not any(map(any, claims)))):
         return denied > USUAL
-    mean = record.means[FAST]
     if mean is None:
         return True
     estimate = MeanOffset(0.0, 0.0, NOTHING, stamp_ns=mean.stamp_ns)
-    claims = (r.mean_offset for r in parties.values())
     return all(lead(estimate, estimate._replace(x=x, y=y), mean) > USUAL for x, y in claims)
 
 

@@ -110,7 +110,6 @@ class OwnPoses:
         hypothesis is updated, if there is one. `least_sigma_m`: of the part of the noise that all
         its reports have in common. `sensitivities`: to the errors that own sightings have in
         common."""
-        state = self.without_misleading(state)
         own = state.memory.teammates.own
         pose = None if own is None else own.by_sender.get(sender)
         if own is None or pose is None or self._present(state) is None:
@@ -171,9 +170,10 @@ class OwnPoses:
         return state.stamp_ns - state.odometry_until_ns > GUESSED_NS
 
     def without_misleading(self, state: State) -> State:
-        """The state after a frame was used, or before a report: at its own pose, if help led it
-        away from there. Between frames that pose follows odometry. Without this a robot that sees
-        no landmark in a turn would be carried on until it sees the next one."""
+        """The state after a frame was used, or before a fix: at its own pose, if help led it away
+        from there. Between frames that pose follows odometry. Without this a robot that sees no
+        landmark in a turn would be carried on until it sees the next one. (While a frame is being
+        used, that pose has its readings already, and the estimate does not.)"""
         teammates, now_ns = state.memory.teammates, state.stamp_ns
         names, bound = own_pose_conflict(teammates.senders, now_ns)
         own = self._present(state, with_hypotheses=True) if names else None

@@ -183,6 +183,18 @@ def bridge(
     return distance, turn, MotionVariance(of_distance * squared, of_turn * squared)
 
 
+def guess_variance(
+    before: Odometry, after: Odometry, crossed_s: float, gap_s: float
+) -> MotionVariance:
+    """How far a robot may be from where it was guessed to be in the first `crossed_s` of a gap
+    between two pieces, as if it drove on as before, now that its speed after the gap is known. With
+    a change of speed at any time T within the gap the guess is off by change * (crossed - T): this
+    is the mean of its square."""
+    (speed, rate), (then, then_rate) = _speeds(before), _speeds(after)
+    k = crossed_s**3 / (3.0 * gap_s)
+    return MotionVariance(k * (then - speed) ** 2, k * (then_rate - rate) ** 2)
+
+
 def _speeds(piece: Odometry) -> tuple[float, float]:
     """The speed (m/s) and the turn rate (rad/s) of a piece of odometry; 0 if that cannot be."""
     seconds = (piece.stamp_ns - piece.from_ns) * 1e-9
@@ -197,9 +209,24 @@ def inflate_by_gap(
     as `gap_speed_m_s` and the last speed do, each for a second. A robot that drove may have turned
     since then, and one that turned may have driven, so the larger of both speeds (m/s, rad/s)
     counts."""
-    fastest = 0.0 if before is None else max(map(abs, _speeds(before)))
-    growth = (gap_speed_m_s**2 + fastest**2) * gap_ns * 1e-9
-    added = Covariance3(growth, 0.0, growth, 0.0, 0.0, growth)
+    return _grown(estimate, (gap_speed_m_s**2 + _fastest(before) ** 2) * gap_ns * 1e-9)
+
+
+def inflate_by_change(
+    estimate: Estimate, gap_ns: int, before: Odometry, after: Odometry
+) -> Estimate:
+    """The same when the speed after the gap is known as well: the larger of both counts."""
+    faster = max(_fastest(after) ** 2 - _fastest(before) ** 2, 0.0)
+    return _grown(estimate, faster * gap_ns * 1e-9)
+
+
+def _fastest(piece: Odometry | None) -> float:
+    return 0.0 if piece is None else max(map(abs, _speeds(piece)))
+
+
+def _grown(estimate: Estimate, variance: float) -> Estimate:
+    """The estimate with so much more variance (m^2, rad^2) of each coordinate."""
+    added = Covariance3(variance, 0.0, variance, 0.0, 0.0, variance)
     return estimate._replace(covariance=estimate.covariance.plus(added))
 
 

@@ -9,6 +9,7 @@ from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.led_astray import gaps_of
 from cpcbl_team.mean_offsets import (
     HEADING_VARIANCE,
+    MOST_SIGMA_M,
     NOTHING,
     about_position,
     with_heading_error,
@@ -20,7 +21,8 @@ from cpcbl_team.sender_records import OffsetEvidence
 from cpcbl_team.state import State
 
 INDEPENDENT_FRAMES = 0.1  # of a camera: the next frame has nearly the same errors of tilt and edges
-CHANGING_M2 = 0.05**2  # the most of the variance (xx + yy) that is another error at the next report
+CHANGING_M2 = 0.05**2  # of the variance (xx + yy) that is another error at the next report
+VAGUE_M2 = 2.0 * MOST_SIGMA_M**2  # so is what exceeds this, for a report corrects such an estimate
 FARTHEST_OFFSET_M = 1.0  # of what a frame tells of the position, where it tells little
 FARTHEST_M = 100.0  # the same of a sighting, which is to say nothing along an axis it does not tell
 
@@ -61,12 +63,15 @@ def position_by_sighting(
 
 def evidence_at(state: State, sums: Sums, dependent: Covariance2 = NOTHING) -> OffsetEvidence:
     """Sums about the offset of the state's estimate, in which the error of its position counts as
-    noise. Where an error lasts, as in a contest, only a part of it changes between reports; the
-    means are to find the rest, so only that part counts."""
+    noise. Only a part of it changes between reports, and the means are to find the rest, so only
+    that part counts. An estimate that is vague is corrected at once, but in a contest."""
     c = state.estimate.covariance
-    share = min(1.0, CHANGING_M2 / max(c.xx + c.yy, CHANGING_M2))
+    variance = c.xx + c.yy
+    share = min(1.0, CHANGING_M2 / max(variance, CHANGING_M2))
+    if variance > VAGUE_M2 and not any(r.rivals for r in state.memory.teammates.senders.values()):
+        share = min(1.0, share + 1.0 - VAGUE_M2 / variance)
     sums = with_position_error(sums, Covariance2(share * c.xx, share * c.xy, share * c.yy))
-    return OffsetEvidence(sums, dependent, c.hh, c.xx + c.yy)
+    return OffsetEvidence(sums, dependent, c.hh, variance)
 
 
 def own_offset(state: State, sums: Information, accepted: Iterable[GatedObject]) -> OffsetEvidence:

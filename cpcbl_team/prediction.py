@@ -9,6 +9,8 @@ from cpcbl_team.motion import (
     NO_VARIANCE,
     MotionVariance,
     bridge,
+    guess_variance,
+    inflate_by_change,
     inflate_by_gap,
     is_gap,
     part_of_piece,
@@ -49,14 +51,17 @@ class Prediction:
         from_ns, until_ns = odometry.from_ns, odometry.stamp_ns
         if until_ns <= from_ns:
             return state.counted("impossible_duration")
-        before = state.odometry
+        before, guessed_ns = state.odometry, 0
         if before is not None and from_ns > state.odometry_until_ns:
             if is_gap(from_ns - state.odometry_until_ns, before, odometry):
                 state = state.counted("odometry_gap")
+                guessed_ns = self._guessed_ns(state, from_ns) if self._moves else 0
             else:
                 state = with_odometry(state, before, from_ns)
         if from_ns > state.stamp_ns:
             state = self.predict(state, from_ns, odometry)
+        if before is not None and guessed_ns > 0:
+            state = self._after_guess(state, before, odometry, guessed_ns)
         if before is not None and before.stamp_ns > state.stamp_ns:
             state = state.counted("odometry_overlap")
         state = with_odometry(state, odometry, max(state.odometry_until_ns, until_ns))
@@ -110,6 +115,29 @@ class Prediction:
             if before is not None and (before.distance_m or before.turn_rad):
                 state = with_recovery(state, without_evidence(state.memory.recovery))
         return with_motion(state, until_ns, estimate, place)
+
+    def _guessed_ns(self, state: State, until_ns: int) -> int:
+        """Which part of a gap that ends then is crossed without the speed after it: the part that
+        other inputs asked for, or all of a long gap."""
+        begin_ns = state.odometry_until_ns
+        if until_ns - begin_ns > self._odometry_timeout_ns:
+            return until_ns - begin_ns
+        return min(state.stamp_ns, until_ns) - begin_ns
+
+    def _after_guess(
+        self, state: State, before: Odometry, after: Odometry, guessed_ns: int
+    ) -> State:
+        """The state after a gap of which such a part was guessed: more uncertain, if the robot has
+        another speed after it."""
+        gap_ns, timeout_ns = after.from_ns - state.odometry_until_ns, self._odometry_timeout_ns
+        guessed_s = min(guessed_ns, timeout_ns) * 1e-9
+        extra = guess_variance(before, after, guessed_s, gap_ns * 1e-9)
+        estimate, silent_ns = state.estimate, gap_ns - timeout_ns
+        if extra != NO_VARIANCE:
+            state, estimate = self._after_arc(state, 0.0, 0.0, 0.0, extra)
+        if silent_ns > 0:
+            estimate = inflate_by_change(estimate, silent_ns, before, after)
+        return state._replace(estimate=estimate)
 
     def _after_arc(
         self, state: State, distance: float, turn: float, crawl_s: float, extra: MotionVariance

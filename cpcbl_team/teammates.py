@@ -274,7 +274,7 @@ class TeammateScreen:
             compared=self.own.compared(state),
         )
         of_it = observation.sender, position, self._rules.least_sigma_m
-        state = self.own.after_report(state, *of_it)
+        state = self.own.after_report(self.own.without_misleading(state), *of_it)
         return self._assess(state, observation.sender, report, observation.source)
 
     def is_changed_by_beliefs(self, item: Input, before: State, after: State, robot: str) -> bool:

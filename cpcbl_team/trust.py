@@ -119,6 +119,7 @@ def with_own_sensor_result(
     record = with_report(senders.get(OWN_SENSORS, SenderRecord()), report, limit)
     if evidence is not None and accepted:
         record = with_evidence(record, stamp_ns, evidence)
+        record = with_denial(record, senders, OWN_SENSORS, report._replace(evidence=evidence))
     return {**senders, OWN_SENSORS: record}
 
 

@@ -19,6 +19,7 @@ from cpcbl_team.estimate import Covariance3
 from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.mean_offsets import USUAL, MeanOffset
 from cpcbl_team.sender_records import (
+    OWN_SENSORS,
     Denial,
     OffsetEvidence,
     QuarantineReason,
@@ -65,6 +66,31 @@ def source(*offsets: float, sigma_m: float = 0.07, mean_m: float | None = None) 
 def supports(record: SenderRecord) -> bool:
     recent = {"dissenter": DISSENTER, "other": record}
     return supporters_of_estimate(recent, {"dissenter"}, LIMIT, BEGAN_NS) == {"other"}
+
+
+def test_own_sensors_alone_say_not_where_the_robot_is_instead() -> None:
+    """They contradict the estimate, whose heading is off. A teammate that comes into sight then
+    agrees with its position, and is not to blame."""
+    recent = {OWN_SENSORS: replace(DISSENTER, mean_offset=(0.0, 0.0)), "other": source()}
+    assert supporters_of_estimate(recent, {OWN_SENSORS}, LIMIT, BEGAN_NS) == set()
+    recent["dissenter"] = DISSENTER
+    dissenters = {OWN_SENSORS, "dissenter"}
+    assert supporters_of_estimate(recent, dissenters, LIMIT, BEGAN_NS) == {"other"}
+
+
+def test_own_sensors_that_measure_rarely_support_the_estimate_by_what_they_measured() -> None:
+    """One landmark a second, which tells the heading and little of the position, agrees with both
+    sides. They have no mean of some seconds."""
+
+    def supports_it(record: SenderRecord, dissenter: SenderRecord = DISSENTER) -> bool:
+        recent = {"dissenter": dissenter, OWN_SENSORS: record}
+        return bool(supporters_of_estimate(recent, {"dissenter"}, LIMIT, BEGAN_NS))
+
+    assert not supports_it(source(0.0, sigma_m=0.5))
+    assert supports_it(source(0.0))
+    assert not supports_it(source(0.0, mean_m=CLAIM_M))  # their mean tells more
+    was_seen = replace(DISSENTER, mean_offset=(0.0, 0.0))  # and has said no place
+    assert supports_it(source(0.0, sigma_m=0.5), was_seen)
 
 
 def test_a_denial_is_the_difference_of_chi_squares() -> None:

@@ -156,6 +156,37 @@ def test_a_robot_that_stood_has_not_moved_in_a_gap() -> None:
     assert still.counts == {"odometry_gap": 1}
 
 
+def test_a_robot_that_began_to_turn_in_a_gap_may_be_turned_by_more_than_it_guessed() -> None:
+    """Sightings came in the gap, so it was guessed to stand. The turn is wrong by the whole rate
+    times the rest of the gap after a time that is uniform in it: hence the root of 3."""
+    robot, state = localizer(odometry=EXACT), state_at(ORIGIN, diagonal(0.0, 0.0))
+    state = robot.add_odometry(state, Odometry(0, PIECE_NS, 0.0, 0.0))
+    for now_ns in (PIECE_NS + PIECE_NS // 2, 2 * PIECE_NS):
+        state = robot.predict(state, now_ns)
+    state = robot.add_odometry(state, Odometry(2 * PIECE_NS, 3 * PIECE_NS, 0.0, 0.1))
+    assert state.counts == {"odometry_gap": 1}
+    assert state.estimate.pose == ORIGIN
+    assert state.estimate.covariance.hh == pytest.approx(0.1**2 / 3.0)
+    assert state.estimate.covariance.xx == 0.0
+
+
+@pytest.mark.parametrize("gap_s", [0.6, 1.0, 3.0])
+@pytest.mark.parametrize("is_asked", [False, True])
+def test_the_speed_after_a_long_gap_says_how_far_it_may_have_come(
+    gap_s: float, is_asked: bool
+) -> None:
+    """It stood before the gap, and turns by 1.5 rad/s after it. When it began, nobody knows: on
+    average (rms) it turned by a root of three less than all of it."""
+    robot, state = localizer(odometry=EXACT), state_at(ORIGIN, diagonal(0.0, 0.0))
+    state = robot.add_odometry(state, Odometry(0, PIECE_NS, 0.0, 0.0))
+    end_ns = PIECE_NS + round(gap_s * SECOND)
+    for now_ns in range(2 * PIECE_NS, end_ns, PIECE_NS) if is_asked else ():
+        state = robot.predict(state, now_ns)
+    turning = Odometry(end_ns, end_ns + SECOND // 10, 0.0, 0.15)
+    state = robot.predict(robot.add_odometry(state, turning), end_ns)
+    assert 0.7 < state.estimate.heading_sigma_rad / (1.5 * gap_s / 3.0**0.5) < 1.4
+
+
 @pytest.mark.parametrize("pause_ns", [1, PIECE_NS // 10, PIECE_NS // 3])
 def test_inexact_stamps_are_no_gap(pause_ns: int) -> None:
     robot, state = localizer(odometry=EXACT), state_at(ORIGIN, diagonal(0.0, 0.0))
