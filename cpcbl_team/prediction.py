@@ -3,7 +3,7 @@
 from cpcbl_team.common_error_filter import CommonErrorFilter
 from cpcbl_team.config import LocalizationSettings
 from cpcbl_team.estimate import ZERO3, Estimate
-from cpcbl_team.geometry import step
+from cpcbl_team.geometry import Pose2, step
 from cpcbl_team.inputs import Odometry
 from cpcbl_team.motion import (
     NO_VARIANCE,
@@ -61,7 +61,7 @@ class Prediction:
         if from_ns > state.stamp_ns:
             state = self.predict(state, from_ns, odometry)
         if before is not None and guessed_ns > 0:
-            state = self._after_guess(state, before, odometry, guessed_ns)
+            state = self._with_change(state, before, odometry, guessed_ns)
         if before is not None and before.stamp_ns > state.stamp_ns:
             state = state.counted("odometry_overlap")
         state = with_odometry(state, odometry, max(state.odometry_until_ns, until_ns))
@@ -97,18 +97,11 @@ class Prediction:
 
     def _across_gap(self, state: State, from_ns: int, following: Odometry | None) -> State:
         """The state after the part of a gap in the odometry since `from_ns`."""
-        until_ns, estimate, place, before, begin_ns, _, _ = state
+        until_ns, _, place, before, begin_ns, _, _ = state
         gap_ns = until_ns - begin_ns
         from_s = max(from_ns - begin_ns, 0) * 1e-9
-        distance, turn, extra = bridge(before, following, from_s, gap_ns * 1e-9, self._odometry)
-        if self._calibration.is_known(state):
-            state, distance, turn = self._calibration.corrected_motion(state, distance, turn)
-            estimate = state.estimate
-        if distance != 0.0 or turn != 0.0 or extra != NO_VARIANCE:
-            if self._common is not None:
-                state = self._common.before_motion(state, distance, turn, 0.0)
-            place = step(place, distance, turn)
-            state, estimate = self._after_arc(state, distance, turn, 0.0, extra)
+        motion = bridge(before, following, from_s, gap_ns * 1e-9, self._odometry)
+        state, estimate, place = self._after_guess(state, place, *motion)
         silent_ns = min(gap_ns - self._odometry_timeout_ns, until_ns - from_ns)
         if silent_ns > 0:
             estimate = inflate_by_gap(estimate, silent_ns, before, self._odometry.gap_speed_m_s)
@@ -124,20 +117,32 @@ class Prediction:
             return until_ns - begin_ns
         return min(state.stamp_ns, until_ns) - begin_ns
 
-    def _after_guess(
+    def _with_change(
         self, state: State, before: Odometry, after: Odometry, guessed_ns: int
     ) -> State:
         """The state after a gap of which such a part was guessed: more uncertain, if the robot has
         another speed after it."""
         gap_ns, timeout_ns = after.from_ns - state.odometry_until_ns, self._odometry_timeout_ns
-        guessed_s = min(guessed_ns, timeout_ns) * 1e-9
+        guessed_s, silent_ns = min(guessed_ns, timeout_ns) * 1e-9, gap_ns - timeout_ns
         extra = guess_variance(before, after, guessed_s, gap_ns * 1e-9)
-        estimate, silent_ns = state.estimate, gap_ns - timeout_ns
-        if extra != NO_VARIANCE:
-            state, estimate = self._after_arc(state, 0.0, 0.0, 0.0, extra)
+        place = state.odometry_from_robot
+        state, estimate, _ = self._after_guess(state, place, 0.0, 0.0, extra)
         if silent_ns > 0:
             estimate = inflate_by_change(estimate, silent_ns, before, after)
         return state._replace(estimate=estimate)
+
+    def _after_guess(
+        self, state: State, place: Pose2, distance: float, turn: float, extra: MotionVariance
+    ) -> tuple[State, Estimate, Pose2]:
+        """The state, the estimate and the place by odometry after a motion that is guessed."""
+        if self._calibration.is_known(state):
+            state, distance, turn = self._calibration.corrected_motion(state, distance, turn)
+        if distance == 0.0 and turn == 0.0 and extra == NO_VARIANCE:
+            return state, state.estimate, place
+        if self._common is not None:
+            state = self._common.before_motion(state, distance, turn, 0.0)
+        state, estimate = self._after_arc(state, distance, turn, 0.0, extra)
+        return state, estimate, step(place, distance, turn)
 
     def _after_arc(
         self, state: State, distance: float, turn: float, crawl_s: float, extra: MotionVariance

@@ -1,14 +1,16 @@
 """Step 1: motion along the known odometry, and missing odometry."""
 
+import random
 from collections.abc import Sequence
 
+import numpy as np
 import pytest
 from msgspec.structs import replace
-from support.core import SECOND, diagonal, frame, localizer, state_at
+from support.core import SECOND, diagonal, frame, localizer, matrix3, state_at
 from support.standing import ORIGIN, STANDING, probabilistic, variants
 
 from cpcbl_team.config import OdometrySettings, Variant
-from cpcbl_team.geometry import Pose2
+from cpcbl_team.geometry import Pose2, step
 from cpcbl_team.inputs import Odometry
 from cpcbl_team.localizer import Localizer
 from cpcbl_team.state import State
@@ -185,6 +187,28 @@ def test_the_speed_after_a_long_gap_says_how_far_it_may_have_come(
     turning = Odometry(end_ns, end_ns + SECOND // 10, 0.0, 0.15)
     state = robot.predict(robot.add_odometry(state, turning), end_ns)
     assert 0.7 < state.estimate.heading_sigma_rad / (1.5 * gap_s / 3.0**0.5) < 1.4
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_what_a_frame_in_a_gap_tells_of_uncertain_scales_counts_before_the_gap_ends(
+    seed: int,
+) -> None:
+    """Each second a piece is lost, a frame comes, and the robot changes its speed. If that told
+    nothing, the way back would take more from the covariance than the way there has added."""
+    dice = random.Random(seed)
+    wheels = OdometrySettings(distance_scale_sigma=0.02, turn_scale_sigma=0.05)
+    robot, truth, (speed, rate) = localizer(odometry=wheels), ORIGIN, (0.0, 0.0)
+    state = robot.start(0)._replace(estimate=state_at(ORIGIN, diagonal(0.1, 0.1)).estimate)
+    for i in range(300):
+        if i % 20 == 0:
+            speed, rate = dice.choice((0.0, 1.0)), dice.uniform(-1.5, 1.5)
+        piece = Odometry(i * PIECE_NS, (i + 1) * PIECE_NS, 0.05 * speed, 0.05 * rate)
+        truth = step(truth, piece.distance_m, piece.turn_rad)
+        if i % 20 == 19:
+            state = robot.cycle(state, frame(truth, piece.stamp_ns))
+        else:
+            state = robot.add_odometry(state, piece)
+        assert np.linalg.eigvalsh(matrix3(state.estimate.covariance))[0] > 0.0
 
 
 @pytest.mark.parametrize("pause_ns", [1, PIECE_NS // 10, PIECE_NS // 3])
