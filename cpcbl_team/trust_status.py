@@ -20,12 +20,17 @@ class TrustStatus(NamedTuple):
 
 
 def trust_statuses(senders: SenderRecords, now_ns: int) -> tuple[TrustStatus, ...]:
-    """The status of each sender that reported recently, or is or was in quarantine."""
+    """The status of each sender that reported recently, or is or was in quarantine, and of each
+    robot of the team that is contested, also while it is silent: this robot is as uncertain as they
+    are apart. Guests that are silent may be any number."""
     statuses = []
     for name, r in sorted(senders.items()):
-        if name != OWN_SENSORS and (r.quarantines or is_reporting(r, now_ns)):
-            is_only = not any(recent_senders(senders, now_ns, name))
-            is_open = bool(open_rivals(senders, name)) or is_contested(senders, name, now_ns)
+        if name == OWN_SENSORS:
+            continue
+        is_open = bool(open_rivals(senders, name)) or is_contested(senders, name, now_ns)
+        is_open, is_recent = is_open and not r.reason, is_reporting(r, now_ns)
+        if r.quarantines or is_recent or (is_open and not r.is_guest):
+            is_only = is_recent and not any(recent_senders(senders, now_ns, name))
             fields = str(r.reason or ""), r.since_ns, r.quarantines, is_only
-            statuses.append(TrustStatus(name, *fields, is_open and not r.reason))
+            statuses.append(TrustStatus(name, *fields, is_open))
     return tuple(statuses)

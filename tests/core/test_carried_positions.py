@@ -152,7 +152,9 @@ def test_a_sender_is_contested_by_one_that_is_silent_since_and_nobody_is_in_quar
     assert all(r.reason is None for r in senders.values())
     assert contest_m(senders, "east") == pytest.approx(1.0, abs=0.05)
     statuses = trust_statuses(senders, 14 * SECOND)
-    assert {s.robot for s in statuses if s.contested} == {"east"}  # the other one is away
+    assert {s.robot for s in statuses if s.contested} == {"east", "west"}  # which is away
+    as_guests = {name: replace(r, is_guest=True) for name, r in senders.items()}
+    assert {s.robot for s in trust_statuses(as_guests, 14 * SECOND)} == {"east"}
 
 
 @pytest.mark.parametrize(

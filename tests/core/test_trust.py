@@ -136,9 +136,17 @@ def test_guests_alone_do_not_show_a_robot_that_it_is_elsewhere() -> None:
     assert united_majority({"a": against, "b": against}, 5 * SECOND) == ("a", "b")
 
 
-def test_own_sensors_outvote_a_sender_that_the_estimate_followed(receiver: Receiver) -> None:
-    receiver.receive(1.0, own=CONTRADICTS, liar=AGREES)
+def test_own_sensors_and_a_teammate_outvote_a_sender_that_the_estimate_followed(
+    receiver: Receiver,
+) -> None:
+    receiver.receive(1.0, own=CONTRADICTS, right=CONTRADICTS, liar=AGREES)
     assert receiver.quarantined == {"liar": "outvoted"}
+
+
+def test_own_sensors_alone_outvote_nobody(receiver: Receiver) -> None:
+    """Perhaps the heading is off, of which a fix of the position tells nothing."""
+    receiver.receive(1.0, own=CONTRADICTS, mate=AGREES)
+    assert receiver.quarantined == {}
 
 
 def test_a_robot_that_every_source_contradicts_quarantines_nobody(receiver: Receiver) -> None:
