@@ -72,7 +72,7 @@ def test_those_that_contradict_own_sensors_led_an_estimate_astray_that_does_too(
 
 def test_nobody_is_blamed_where_nobody_contradicts_own_sensors_as_clearly_as_the_estimate() -> None:
     """Own sensors were off by chance, and a correct observer by 20."""
-    senders = {**TWO_OF_FOUR, "c": says(20.0), "d": says(21.0)}
+    senders = {**TWO_OF_FOUR, "c": says(20.0), "d": says(20.5)}
     assert misleading(senders, estimate_at(0.3), OWN) == set()
     assert misleading({**senders, "d": says(25.0)}, estimate_at(0.3), OWN) == {"c", "d"}
 
