@@ -149,7 +149,8 @@ def _denies(record: SenderRecord, parties: SenderRecords, is_own: bool) -> bool:
     that was only seen says no place that could be denied."""
     claims = [r.mean_offset for r in parties.values()]
     denied, mean = _denied(record, parties), record.means[FAST]
-    if denied is not None and not (is_own and (mean or not any(map(any, claims)))):
+    by_reports = not is_own or (mean is None and any(map(any, claims)))
+    if denied is not None and by_reports:
         return denied > USUAL
     if mean is None:
         return True
