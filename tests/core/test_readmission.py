@@ -21,7 +21,7 @@ def receiver() -> Receiver:
 def test_one_that_was_outvoted_is_readmitted_after_as_long_as_others(receiver: Receiver) -> None:
     """It had never contradicted the estimate, so it came back after ten reports, and an echo led
     the estimate away again."""
-    receiver.receive(1.0, own=CONTRADICTS, liar=AGREES)
+    receiver.receive(1.0, own=CONTRADICTS, right=CONTRADICTS, liar=AGREES)
     assert receiver.quarantined == {"liar": "outvoted"}
     receiver.receive(RULES.readmit_s - 1.0, own=AGREES, liar=AGREES)
     assert receiver.quarantined
