@@ -183,16 +183,29 @@ def bridge(
     return distance, turn, MotionVariance(of_distance * squared, of_turn * squared)
 
 
+class PoseTimes(NamedTuple):
+    """A time of the position and one of the heading, s."""
+
+    position_s: float
+    heading_s: float
+
+
 def guess_variance(
-    before: Odometry, after: Odometry, crossed_s: float, gap_s: float
+    before: Odometry, after: Odometry, crossed_s: float, gap_s: float, updated: PoseTimes
 ) -> MotionVariance:
     """How far a robot may be from where it was guessed to be in the first `crossed_s` of a gap
-    between two pieces, as if it drove on as before, now that its speed after the gap is known. With
-    a change of speed at any time T within the gap the guess is off by change * (crossed - T): this
-    is the mean of its square."""
+    between two pieces, as if it drove on as before, now that its speed after the gap is known.
+    `updated`: when sightings last told its position and its heading in the gap, since its begin."""
     (speed, rate), (then, then_rate) = _speeds(before), _speeds(after)
-    k = crossed_s**3 / (3.0 * gap_s)
-    return MotionVariance(k * (then - speed) ** 2, k * (then_rate - rate) ** 2)
+    of_distance = _mean_square_s2(crossed_s, gap_s, updated.position_s) * (then - speed) ** 2
+    of_turn = _mean_square_s2(crossed_s, gap_s, updated.heading_s) * (then_rate - rate) ** 2
+    return MotionVariance(of_distance, of_turn)
+
+
+def _mean_square_s2(crossed_s: float, gap_s: float, updated_s: float) -> float:
+    """The mean square of crossed - max(T, updated), for a change at any time T within the gap."""
+    left_s = max(crossed_s - updated_s, 0.0)
+    return left_s * left_s * (updated_s + left_s / 3.0) / gap_s
 
 
 def _speeds(piece: Odometry) -> tuple[float, float]:
@@ -209,24 +222,26 @@ def inflate_by_gap(
     as `gap_speed_m_s` and the last speed do, each for a second. A robot that drove may have turned
     since then, and one that turned may have driven, so the larger of both speeds (m/s, rad/s)
     counts."""
-    return _grown(estimate, (gap_speed_m_s**2 + _fastest(before) ** 2) * gap_ns * 1e-9)
+    growth = (gap_speed_m_s**2 + _fastest(before) ** 2) * gap_ns * 1e-9
+    return _grown(estimate, growth, growth)
 
 
 def inflate_by_change(
-    estimate: Estimate, gap_ns: int, before: Odometry, after: Odometry
+    estimate: Estimate, silent: PoseTimes, before: Odometry, after: Odometry
 ) -> Estimate:
-    """The same when the speed after the gap is known as well: the larger of both counts."""
+    """The same when the speed after the gap is known as well: the larger of both counts. `silent`:
+    how long the position and the heading had neither odometry nor an update, s."""
     faster = max(_fastest(after) ** 2 - _fastest(before) ** 2, 0.0)
-    return _grown(estimate, faster * gap_ns * 1e-9)
+    return _grown(estimate, faster * silent.position_s, faster * silent.heading_s)
 
 
 def _fastest(piece: Odometry | None) -> float:
     return 0.0 if piece is None else max(map(abs, _speeds(piece)))
 
 
-def _grown(estimate: Estimate, variance: float) -> Estimate:
-    """The estimate with so much more variance (m^2, rad^2) of each coordinate."""
-    added = Covariance3(variance, 0.0, variance, 0.0, 0.0, variance)
+def _grown(estimate: Estimate, of_position: float, of_heading: float) -> Estimate:
+    """The estimate with so much more variance of each coordinate (m^2) and of the heading."""
+    added = Covariance3(of_position, 0.0, of_position, 0.0, 0.0, of_heading)
     return estimate._replace(covariance=estimate.covariance.plus(added))
 
 

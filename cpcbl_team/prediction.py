@@ -8,6 +8,7 @@ from cpcbl_team.inputs import Odometry
 from cpcbl_team.motion import (
     NO_VARIANCE,
     MotionVariance,
+    PoseTimes,
     bridge,
     guess_variance,
     inflate_by_change,
@@ -121,14 +122,17 @@ class Prediction:
         self, state: State, before: Odometry, after: Odometry, guessed_ns: int
     ) -> State:
         """The state after a gap of which such a part was guessed: more uncertain, if the robot has
-        another speed after it."""
-        gap_ns, timeout_ns = after.from_ns - state.odometry_until_ns, self._odometry_timeout_ns
-        guessed_s, silent_ns = min(guessed_ns, timeout_ns) * 1e-9, gap_ns - timeout_ns
-        extra = guess_variance(before, after, guessed_s, gap_ns * 1e-9)
+        another speed after it. What it saw within the gap tells of the change until then."""
+        begin_ns, timeout_s = state.odometry_until_ns, self._odometry_timeout_ns * 1e-9
+        gap_s, guessed_s = (after.from_ns - begin_ns) * 1e-9, min(guessed_ns * 1e-9, timeout_s)
+        last_ns = state.updates.position_ns, state.updates.heading_ns
+        updated = PoseTimes(*(max((ns or begin_ns) - begin_ns, 0) * 1e-9 for ns in last_ns))
+        extra = guess_variance(before, after, guessed_s, gap_s, updated)
         place = state.odometry_from_robot
         state, estimate, _ = self._after_guess(state, place, 0.0, 0.0, extra)
-        if silent_ns > 0:
-            estimate = inflate_by_change(estimate, silent_ns, before, after)
+        silent = PoseTimes(*(max(gap_s - max(timeout_s, t), 0.0) for t in updated))
+        if any(silent):
+            estimate = inflate_by_change(estimate, silent, before, after)
         return state._replace(estimate=estimate)
 
     def _after_guess(

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 from msgspec.structs import replace
-from support.core import SECOND, diagonal, frame, localizer, matrix3, state_at
+from support.core import SECOND, diagonal, fix, frame, localizer, matrix3, state_at
 from support.standing import ORIGIN, STANDING, probabilistic, variants
 
 from cpcbl_team.config import OdometrySettings, Variant
@@ -189,14 +189,29 @@ def test_the_speed_after_a_long_gap_says_how_far_it_may_have_come(
     assert 0.7 < state.estimate.heading_sigma_rad / (1.5 * gap_s / 3.0**0.5) < 1.4
 
 
+@pytest.mark.parametrize("gap_s", [0.3, 2.0])
+def test_a_robot_that_sees_landmarks_in_a_gap_stays_as_certain_as_these_make_it(
+    gap_s: float,
+) -> None:
+    """Its driver sends odometry only while it moves."""
+    robot, state = localizer(), state_at(ORIGIN, diagonal(0.05, 0.05))
+    state = robot.add_odometry(state, Odometry(0, PIECE_NS, 0.0, 0.0))
+    end_ns = PIECE_NS + round(gap_s * SECOND)
+    for now_ns in range(2 * PIECE_NS, end_ns + 1, PIECE_NS):
+        state = robot.cycle(state, frame(ORIGIN, now_ns))
+    after = robot.add_odometry(state, Odometry(end_ns, end_ns + PIECE_NS, 0.0, 0.075))
+    assert after.counts["odometry_gap"] == 1
+    assert after.estimate.covariance == state.estimate.covariance
+
+
 @pytest.mark.parametrize("seed", range(3))
-def test_what_a_frame_in_a_gap_tells_of_uncertain_scales_counts_before_the_gap_ends(
+def test_what_a_fix_in_a_gap_tells_of_uncertain_scales_counts_before_the_gap_ends(
     seed: int,
 ) -> None:
-    """Each second a piece is lost, a frame comes, and the robot changes its speed. If that told
+    """Each second a piece is lost, a fix comes, and the robot changes its speed. If that told
     nothing, the way back would take more from the covariance than the way there has added."""
     dice = random.Random(seed)
-    wheels = OdometrySettings(distance_scale_sigma=0.02, turn_scale_sigma=0.05)
+    wheels = OdometrySettings(distance_scale_sigma=0.05, turn_scale_sigma=0.1)
     robot, truth, (speed, rate) = localizer(odometry=wheels), ORIGIN, (0.0, 0.0)
     state = robot.start(0)._replace(estimate=state_at(ORIGIN, diagonal(0.1, 0.1)).estimate)
     for i in range(300):
@@ -204,10 +219,12 @@ def test_what_a_frame_in_a_gap_tells_of_uncertain_scales_counts_before_the_gap_e
             speed, rate = dice.choice((0.0, 1.0)), dice.uniform(-1.5, 1.5)
         piece = Odometry(i * PIECE_NS, (i + 1) * PIECE_NS, 0.05 * speed, 0.05 * rate)
         truth = step(truth, piece.distance_m, piece.turn_rad)
-        if i % 20 == 19:
-            state = robot.cycle(state, frame(truth, piece.stamp_ns))
-        else:
+        if i % 20 < 19:
             state = robot.add_odometry(state, piece)
+        else:
+            x, y, heading = truth
+            seen = fix(x, y, piece.stamp_ns, heading=heading, sensor_m=0.005, observer_m=0.0)
+            state = robot.add_fix(state, seen)
         assert np.linalg.eigvalsh(matrix3(state.estimate.covariance))[0] > 0.0
 
 
