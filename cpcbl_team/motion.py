@@ -26,6 +26,13 @@ class MotionVariance(NamedTuple):
     turn: float  # rad^2
 
 
+class PoseTimes(NamedTuple):
+    """A time of the position and one of the heading, s."""
+
+    position_s: float
+    heading_s: float
+
+
 DRIFT_SHARE: Final = 0.1  # of the way: how far dead reckoning errs, roughly
 NO_VARIANCE: Final = MotionVariance(0.0, 0.0)
 AT_REST: Final = Estimate(Pose2(0.0, 0.0, 0.0), ZERO3)
@@ -183,13 +190,6 @@ def bridge(
     return distance, turn, MotionVariance(of_distance * squared, of_turn * squared)
 
 
-class PoseTimes(NamedTuple):
-    """A time of the position and one of the heading, s."""
-
-    position_s: float
-    heading_s: float
-
-
 def guess_variance(
     before: Odometry, after: Odometry, crossed_s: float, gap_s: float, updated: PoseTimes
 ) -> MotionVariance:
@@ -229,8 +229,9 @@ def inflate_by_gap(
 def inflate_by_change(
     estimate: Estimate, silent: PoseTimes, before: Odometry, after: Odometry
 ) -> Estimate:
-    """The same when the speed after the gap is known as well: the larger of both counts. `silent`:
-    how long the position and the heading had neither odometry nor an update, s."""
+    """What `inflate_by_gap` gave becomes, when the speed after the gap is known: the larger one of
+    both speeds counts. `silent`: for how long neither odometry nor sightings told the position, and
+    the heading."""
     faster = max(_fastest(after) ** 2 - _fastest(before) ** 2, 0.0)
     return _grown(estimate, faster * silent.position_s, faster * silent.heading_s)
 

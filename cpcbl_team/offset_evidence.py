@@ -21,8 +21,8 @@ from cpcbl_team.sender_records import OffsetEvidence
 from cpcbl_team.state import State
 
 INDEPENDENT_FRAMES = 0.1  # of a camera: the next frame has nearly the same errors of tilt and edges
-CHANGING_M2 = 0.05**2  # of the variance (xx + yy) that is another error at the next report
-VAGUE_M2 = 2.0 * MOST_SIGMA_M**2  # so is what exceeds this, for a report corrects such an estimate
+CHANGING_M2 = 0.05**2  # so much of the variance (xx + yy) is another error at the next report,
+VAGUE_M2 = 2.0 * MOST_SIGMA_M**2  # and all beyond this: a report corrects a vague estimate
 FARTHEST_OFFSET_M = 1.0  # of what a frame tells of the position, where it tells little
 FARTHEST_M = 100.0  # the same of a sighting, which is to say nothing along an axis it does not tell
 
@@ -69,7 +69,7 @@ def evidence_at(state: State, sums: Sums, dependent: Covariance2 = NOTHING) -> O
     variance = c.xx + c.yy
     share = min(1.0, CHANGING_M2 / max(variance, CHANGING_M2))
     if variance > VAGUE_M2 and not any(r.rivals for r in state.memory.teammates.senders.values()):
-        share = min(1.0, share + 1.0 - VAGUE_M2 / variance)
+        share = share + 1.0 - VAGUE_M2 / variance
     sums = with_position_error(sums, Covariance2(share * c.xx, share * c.xy, share * c.yy))
     return OffsetEvidence(sums, dependent, c.hh, variance)
 
